@@ -1,0 +1,174 @@
+"""Questions about actors: who owns what, what is visible, how heavy it is.
+
+Arrays "by label" have one row an element; the row of a label describes the actor of
+that name, and rows that name no actor are zero or False. All of it is computed from the
+state when asked, nothing is stored.
+"""
+
+import jax
+import jax.numpy as jnp
+
+from blastjax import graph, pytree, spatial
+from blastjax.core import NONE, Asset, State
+
+
+@pytree.dataclass
+class Moments(pytree.Node):
+    """Mass, centre and inertia of each actor, in the rest frame of the asset."""
+
+    mass: jax.Array
+    """(A,) by label, kg."""
+    center: jax.Array
+    """(A, 3) by label, centre of mass, m."""
+    inertia: jax.Array
+    """(A, 3, 3) by label, about the centre of mass, rest axes, kg m^2."""
+
+
+def _take(values: jax.Array, index: jax.Array, fill: float) -> jax.Array:
+    """Return values[index], and fill where the index is NONE."""
+    if values.shape[0] == 0:
+        return jnp.full((index.shape[0], *values.shape[1:]), fill, values.dtype)
+    rows = values[jnp.maximum(index, 0)]
+    here = (index >= 0).reshape(-1, *[1] * (values.ndim - 1))
+    return jnp.where(here, rows, jnp.asarray(fill, values.dtype))
+
+
+def element_values(asset: Asset, values: jax.Array, fill: float = 0) -> jax.Array:
+    """Return per-chunk values (C, ...) per element (A, ...), fill where no chunk is."""
+    return _take(values, asset.element_chunk, fill)
+
+
+def is_chunk(asset: Asset) -> jax.Array:
+    """Return which elements are chunks, (A,) bool: not the world, not padding."""
+    return asset.element_chunk >= 0
+
+
+def active(asset: Asset, state: State) -> jax.Array:
+    """Return which labels name an actor, (A,) bool.
+
+    The world alone is no actor.
+    """
+    labels = jnp.arange(state.actor.shape[0], dtype=jnp.int32)
+    named = state.actor == labels
+    if asset.has_world:
+        named = named.at[0].set(jnp.any((state.actor == 0) & is_chunk(asset)))
+    return named
+
+
+def node_count(asset: Asset, state: State) -> jax.Array:
+    """Return the graph nodes of each actor, the world included, (A,) int32 by label.
+
+    Sub-support actors have none.
+    """
+    owner = state.actor[: asset.span_node.shape[0]]
+    return graph.group_sum(jnp.ones_like(owner), owner, state.actor.shape[0])
+
+
+def alone(asset: Asset, state: State) -> jax.Array:
+    """Return which elements are an actor by themselves, (A,) bool.
+
+    These take damage to their chunk; an actor of several nodes takes it to its bonds.
+    """
+    count = node_count(asset, state)
+    owned = (state.actor != NONE) & is_chunk(asset)
+    return owned & (count[jnp.maximum(state.actor, 0)] <= 1)
+
+
+def held(asset: Asset, state: State) -> jax.Array:
+    """Return which actors the world holds, (A,) bool by label."""
+    first = jnp.arange(state.actor.shape[0]) == 0
+    return active(asset, state) & first & asset.has_world
+
+
+def can_fracture(asset: Asset, state: State) -> jax.Array:
+    """Return which actors damage can still change, (A,) bool by label.
+
+    An actor of several nodes always can; a single chunk only while it has health.
+    """
+    several = node_count(asset, state) > 1
+    return active(asset, state) & (several | (state.chunk_health > 0))
+
+
+def split_required(asset: Asset, state: State) -> jax.Array:
+    """Return which actors may come apart at the next split, (A,) bool by label.
+
+    True of an actor of several nodes that lost a bond (it may still hold together), and
+    of a single chunk without health that has children.
+    """
+    capacity = state.actor.shape[0]
+    several = node_count(asset, state) > 1
+    nodes = asset.span_node.shape[0]
+    touched = graph.group_any(state.dirty, state.actor[:nodes], capacity)
+    gives_way = (state.chunk_health <= 0) & has_children(asset)
+    return active(asset, state) & jnp.where(several, touched, gives_way)
+
+
+def has_children(asset: Asset) -> jax.Array:
+    """Return which elements' chunks have children, (A,) bool."""
+    return element_values(asset, asset.chunk_children) > 0
+
+
+def owner(asset: Asset, state: State) -> jax.Array:
+    """Return the actor that owns each chunk whole, (C,) int32 labels or NONE.
+
+    A chunk above the support level belongs to an actor if all support chunks below it
+    do; a chunk below it, if the support chunk above gave way and its turn has come.
+    """
+    direct = _take(state.actor, asset.chunk_element, NONE)
+    if asset.height == 0:
+        return direct
+    # In depth-first order a subtree is a range: it has one owner if no neighbours in
+    # the range differ, which a running count of differences tells.
+    label = state.actor[asset.span_node]
+    differs = jnp.concatenate([jnp.zeros(1, bool), label[1:] != label[:-1]])
+    count = jnp.cumsum(differs.astype(jnp.int32))
+    first = asset.chunk_span[:, 0]
+    last = jnp.maximum(asset.chunk_span[:, 1] - 1, first)
+    some = asset.chunk_span[:, 1] > first
+    one = some & (count[last] == count[first])
+    above = asset.chunk_element < 0
+    return jnp.where(above, jnp.where(one, label[first], NONE), direct)
+
+
+def visible(asset: Asset, state: State) -> jax.Array:
+    """Return the visible chunks, (C,) bool: the coarsest that stand for each actor."""
+    chunk_owner = owner(asset, state)
+    parent_owner = _take(chunk_owner, asset.chunk_parent, NONE)
+    return (chunk_owner != NONE) & (parent_owner != chunk_owner)
+
+
+def moments(asset: Asset, state: State, density: float | jax.Array) -> Moments:
+    """Sum up the chunks of each actor.
+
+    Args:
+      asset: the asset.
+      state: its state.
+      density: kg/m^3, one for all or (C,).
+
+    Returns:
+      Moments by label. Differentiable in density, volumes, centroids and inertias; the
+      grouping is constant.
+    """
+    capacity = state.actor.shape[0]
+    density = jnp.broadcast_to(
+        jnp.asarray(density, asset.chunk_volume.dtype), asset.chunk_volume.shape
+    )
+    weight = element_values(asset, density * asset.chunk_volume)
+    place = element_values(asset, asset.chunk_centroid)
+    sums = graph.group_sum(
+        jnp.concatenate([weight[:, None], weight[:, None] * place], axis=1),
+        state.actor,
+        capacity,
+    )
+    mass = sums[:, 0]
+    center = spatial.ratio(sums[:, 1:], mass[:, None])
+    # About the actor's own centre, in a second pass: the difference of two large sums
+    # would cost float32 its digits far from the origin.
+    arm = place - _take(center, state.actor, 0.0)
+    square = spatial.dot(arm, arm)[:, None, None] * jnp.eye(3, dtype=arm.dtype)[None]
+    steiner = square - arm[:, :, None] * arm[:, None, :]
+    spin = element_values(asset, density[:, None, None] * asset.chunk_inertia)
+    inertia = graph.group_sum(
+        spin + weight[:, None, None] * steiner, state.actor, capacity
+    )
+    return Moments(mass=mass, center=center, inertia=inertia)
