@@ -25,6 +25,8 @@ WORLD = -1
 """The world's place in a bond description's pair of chunks, and node 0's chunk."""
 NONE = -1
 """Absent: no chunk, no element, no actor."""
+NO_WORLD = -2
+"""Node 0's chunk where padding made room for a world that the asset does not have."""
 UNBREAKABLE = 1.7e38
 """Healths from here up (half of the largest float32) mean unbreakable, as in Blast."""
 
@@ -52,7 +54,7 @@ class Asset(pytree.Node):
     span_node: jax.Array
     """(N,) nodes in depth-first order of the hierarchy, the world and padding last."""
     element_chunk: jax.Array
-    """(A,) chunk of the element, NONE for the world and padding."""
+    """(A,) chunk of the element; WORLD or NO_WORLD for node 0, NONE for padding."""
     element_parent: jax.Array
     """(A,) parent element of a sub-support chunk, NONE for nodes and padding."""
     bond_nodes: jax.Array

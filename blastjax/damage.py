@@ -241,12 +241,12 @@ class Material(pytree.Node):
 def normalize(material: Material, amount: Scalar) -> jax.Array:
     """Return raw damage in units of the material's health, between its thresholds.
 
-    A material without health takes raw damage as it is. NaN does nothing.
+    To a material without health any damage is one unit. NaN does nothing.
     """
     amount = jnp.asarray(amount)
     health = jnp.asarray(material.health, amount.dtype)
     tough = health > 0
-    units = jnp.where(tough, amount / jnp.where(tough, health, 1), amount)
+    units = jnp.where(tough, amount / jnp.where(tough, health, 1), 1)
     capped = jnp.where(units < material.max_threshold, units, material.max_threshold)
     return jnp.where(units > material.min_threshold, capped, 0)
 

@@ -18,6 +18,7 @@ from blastjax import chunks, graph
 from blastjax.core import (
     NONE,
     UNBREAKABLE,
+    WORLD,
     Asset,
     Damage,
     FractureEvents,
@@ -39,7 +40,7 @@ def init(
     bond_health: float | jax.Array = 1.0,
     chunk_health: float | jax.Array = 1.0,
 ) -> State:
-    """Return the state of an unbroken asset: one actor, label 0.
+    """Return the state of an unbroken asset: one actor.
 
     Args:
       asset: the asset.
@@ -67,13 +68,16 @@ def init(
 
     in_graph = jnp.arange(capacity) < num_nodes
     belongs = in_graph & real_chunk
+    label = jnp.zeros((), jnp.int32)
     if asset.has_world:
-        belongs = belongs.at[0].set(True)
+        world = asset.element_chunk[0] == WORLD
+        belongs = belongs.at[0].set(world)
+        label = jnp.where(world, 0, 1).astype(jnp.int32)
     return State(
         bond_health=jnp.where(real_bond, bond, 0),
         bond_intact=real_bond,
         chunk_health=jnp.where(real_chunk, chunk, 0),
-        actor=jnp.where(belongs, 0, NONE).astype(jnp.int32),
+        actor=jnp.where(belongs, label, NONE),
         dirty=jnp.zeros(num_nodes, bool),
         bond_unbreakable=_unbreakable(bond_health, bond),
         chunk_unbreakable=_unbreakable(chunk_health, chunk),
@@ -221,23 +225,31 @@ def apply_buffer(
     return state, jax.tree.map(total, events)
 
 
-def split(asset: Asset, state: State) -> tuple[State, SplitEvents]:
+def split(
+    asset: Asset, state: State, *, actors: jax.Array | None = None
+) -> tuple[State, SplitEvents]:
     """Find the actors: islands of nodes, and children of chunks that gave way.
 
     A chunk that is an actor by itself, has no health left and has children is replaced
     by them, and they by theirs, as far as it goes. A dead chunk without children stays.
+
+    Args:
+      asset: the asset.
+      state: its state.
+      actors: (A,) bool by label, the actors to split; None for all.
 
     Returns:
       The state and which actors are new. Integers: no derivative passes through.
     """
     num_nodes, capacity = asset.span_node.shape[0], state.actor.shape[0]
     old = state.actor
+    chosen = old != NONE
+    if actors is not None:
+        chosen = chosen & actors[jnp.maximum(old, 0)]
     label = graph.islands(asset.bond_nodes, state.bond_intact, num_nodes)
-    label = jnp.where(old[:num_nodes] != NONE, label, NONE)
-    if asset.has_world:
-        label = label.at[0].set(0)
+    label = jnp.where(chosen[:num_nodes], label, old[:num_nodes])
     actor = old.at[:num_nodes].set(label)
-    state = state.replace(actor=actor, dirty=jnp.zeros_like(state.dirty))
+    state = state.replace(actor=actor, dirty=state.dirty & ~chosen[:num_nodes])
 
     origin = old
     released = jnp.zeros(capacity, bool)
@@ -245,7 +257,7 @@ def split(asset: Asset, state: State) -> tuple[State, SplitEvents]:
         elements = jnp.arange(capacity, dtype=jnp.int32)
         parent = jnp.maximum(asset.element_parent, 0)
         gives_way = (state.chunk_health <= 0) & chunks.has_children(asset)
-        released = chunks.alone(asset, state) & gives_way
+        released = chosen & chunks.alone(asset, state) & gives_way
         for _ in range(asset.depth):
             freed = (asset.element_parent >= 0) & released[parent]
             origin = jnp.where(freed, origin[parent], origin)

@@ -34,7 +34,7 @@ class Bonds:
     """Bond descriptions, one row a bond."""
 
     chunks: Any
-    """(B, 2) indices of chunk descriptions; WORLD in place of one binds to the world."""
+    """(B, 2) indices of chunk descriptions; WORLD for one binds to the world."""
     normal: Any
     """(B, 3) unit normal, from the first chunk to the second."""
     area: Any
@@ -191,7 +191,7 @@ def reals(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
         raise ValueError(f"{name} has dtype {array.dtype}; it must hold real numbers")
     shaped(name, array, shape)
     array = array.astype(np.float64)
-    finite = np.isfinite(array).reshape(len(array), -1).all(axis=1)
+    finite = np.isfinite(array).all(axis=tuple(range(1, array.ndim)))
     refuse(~finite, array, name + " {i} is {v}; it must be finite")
     return array
 

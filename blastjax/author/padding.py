@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from blastjax.core import NO_PARENT, NONE, Asset
+from blastjax.core import NO_PARENT, NO_WORLD, NONE, Asset
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,8 +92,9 @@ def pad(asset: Asset, to: Capacity) -> Asset:
         rest = np.full((size - len(x), *x.shape[1:]), fill, x.dtype)
         return jnp.asarray(np.concatenate([x, rest]))
 
-    def moved(x: np.ndarray) -> jax.Array:
+    def moved(x: np.ndarray, first: int = NONE) -> jax.Array:
         rows = np.full(elements, NONE, x.dtype)
+        rows[0] = first
         rows[place] = x
         return jnp.asarray(rows)
 
@@ -110,7 +111,7 @@ def pad(asset: Asset, to: Capacity) -> Asset:
         chunk_element=grown(renamed(asset.chunk_element), to.chunks, NONE),
         chunk_span=grown(asset.chunk_span, to.chunks),
         span_node=jnp.asarray(span_node),
-        element_chunk=moved(asset.element_chunk),
+        element_chunk=moved(asset.element_chunk, NO_WORLD if shift else NONE),
         element_parent=moved(renamed(asset.element_parent)),
         bond_nodes=grown(asset.bond_nodes + np.int32(shift), to.bonds),
         bond_normal=grown(asset.bond_normal, to.bonds),
