@@ -101,8 +101,9 @@ def bucket(need):
 class Replay:
     """One case on its way through the library; `found` lists what differs."""
 
-    def __init__(self, case):
+    def __init__(self, case, padded=True):
         self.case = case
+        self.padded = padded
         self.found = []
         self.differences = collections.Counter()
 
@@ -239,17 +240,21 @@ class Replay:
         starts = np.searchsorted(ends[order, 0], np.arange(nodes + 1))
         expect("adjacency", starts, case["adj_partition"])
 
-        self.capacity = bucket(own)
-        self.shift = int(not world)
-        self.asset = author.pad(built.asset, self.capacity)
+        if self.padded:
+            self.capacity = bucket(own)
+            self.asset = author.pad(built.asset, self.capacity)
+        else:
+            # As many levels as a padded one is traced for: sizes alone tell programs
+            # apart, of which each costs a compilation.
+            self.capacity = own
+            self.asset = built.asset.replace(depth=4, height=4)
+        self.shift = int(self.asset.has_world)
         self.call = compiled()
 
     def node(self, index):
         """Return the library's number of a node of Blast's, padded."""
-        index = np.asarray(index, np.int64)
-        if self.shift:
-            return index + 1
-        return (index + 1) % self.num_nodes
+        world = signed(self.case["node_chunk"])[index] < 0
+        return np.where(world, 0, np.asarray(index, np.int64) + self.shift)
 
     def element(self, chunk):
         """Return the element of a chunk, padded; -1 above the support level."""
@@ -402,7 +407,7 @@ class Replay:
             seen = np.flatnonzero(visible & (owner == label))
             self.expect(name + " visible chunks", seen, theirs["visible"])
             external = bool(theirs["actor_external"])
-            if held[label] != external and not self.unsplit(number):
+            if held[label] != external and not self.unsplit(recorded, theirs):
                 self.expect(name + " held", held[label], external)
             can = bool(theirs["actor_can_fracture"])
             self.expect(name + " can fracture", can_fracture[label], can)
@@ -414,10 +419,12 @@ class Replay:
         self.expect(where + " owned chunks", owned, chunk_actor >= 0)
         return len(self.found) == before
 
-    def unsplit(self, number):
-        """Whether the asset is of several parts, unsplit, the world not in the first."""
-        islands = self.case["states"][number]["node_island"]
-        parted = number == 0 and bool(np.any(islands != islands[0]))
+    def unsplit(self, recorded, actor):
+        """Whether an actor, not split yet, is of parts that the world is not all of."""
+        members = list(map(int, actor["nodes"]))
+        if actor["actor_graph_node_count"] > len(members):
+            members.append(self.num_nodes - 1)
+        parted = len(set(recorded["node_island"][members].tolist())) > 1
         self.differences["unsplit, world elsewhere"] += parted
         return parted
 

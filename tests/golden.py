@@ -1,0 +1,69 @@
+"""Replay recorded Blast data: `python -m tests.golden lowlevel|desc FILE.npz`.
+
+Every case goes two ways: through the public library, compared at level 1 (partition,
+visible chunks, flags, healths, damage), and through the plain-Python reference, compared
+to the last bit and list order, so that no number of a file goes unread. The last line
+counts mismatches and, by name, where the library differs from Blast on purpose; the exit
+code is 0 only if there are no mismatches.
+"""
+
+import argparse
+import collections
+import sys
+import time
+
+from tests import conformance, recorded, replay
+
+
+def lowlevel(path):
+    """Yield (case number, mismatches, differences) of a recording of damage."""
+    for case in recorded.lowlevel_cases(path):
+        found, differences = conformance.check_lowlevel(case)
+        yield case["case_id"], found + replay.verify_lowlevel(case), differences
+
+
+def desc(path):
+    """Yield (case number, mismatches, differences) of a recording of descriptors."""
+    for case in recorded.desc_cases(path):
+        yield case["desc_id"], conformance.check_desc(case) + replay.verify_desc(case), {}
+
+
+KINDS = {"lowlevel": lowlevel, "desc": desc}
+
+
+def run(kind, path, say=print):
+    """Replay a file; return the number of mismatched cases."""
+    start = time.perf_counter()
+    cases = mismatches = 0
+    total = collections.Counter()
+    try:
+        for number, found, differences in KINDS[kind](path):
+            cases += 1
+            mismatches += bool(found)
+            total.update(differences)
+            for line in found[:5]:
+                say(f"case {number}: {line}")
+    except (ValueError, KeyError, IndexError) as error:
+        # A file whose counts do not add up cannot be cut into cases.
+        mismatches += 1
+        say(f"after {cases} cases: {type(error).__name__}: {error}")
+    counted = "".join(f", {n} {name}" for name, n in sorted(total.items()))
+    seconds = time.perf_counter() - start
+    say(f"{kind}: {cases} cases, {mismatches} mismatches{counted}, {seconds:.0f} s")
+    return mismatches
+
+
+def main(arguments=None):
+    """Run the command line; return its exit code."""
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.golden",
+        description="Replay recorded Blast data through blastjax.",
+    )
+    parser.add_argument("kind", choices=sorted(KINDS), help="what the file records")
+    parser.add_argument("file", help="the recording, an npz file")
+    options = parser.parse_args(arguments)
+    return 1 if run(options.kind, options.file) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
