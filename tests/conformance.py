@@ -247,7 +247,7 @@ class Replay:
             # As many levels as a padded one is traced for: sizes alone tell programs
             # apart, of which each costs a compilation.
             self.capacity = own
-            self.asset = built.asset.replace(depth=4, height=4)
+            self.asset = built.asset.replace(depth=max(4, own.depth), height=4)
         self.shift = int(self.asset.has_world)
         self.call = compiled()
 
