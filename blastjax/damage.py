@@ -206,7 +206,7 @@ def impact_spread(
         asset.bond_nodes,
         jnp.where(passable, stride, jnp.inf),
         jnp.where(single, NONE, start),
-        jax.lax.stop_gradient(high),
+        high,
         asset.span_node.shape[0],
     )
     nearer = jnp.where(to_world, way[first], jnp.minimum(way[first], way[second]))
@@ -290,8 +290,8 @@ def push(buffer: Buffer, event: Any) -> Buffer:
     )
     return Buffer(
         events=events,
-        count=buffer.count + fits,
-        dropped=buffer.dropped + ~fits,
+        count=buffer.count + fits.astype(jnp.int32),
+        dropped=buffer.dropped + (~fits).astype(jnp.int32),
     )
 
 

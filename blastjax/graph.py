@@ -58,8 +58,9 @@ def shortest_ways(
       num_nodes: N.
 
     Returns:
-      (N,) lengths, infinite where no way leads. Not differentiable.
+      (N,) lengths, infinite where no way leads. Constant under differentiation.
     """
+    length, limit = jax.lax.stop_gradient((length, limit))
     start = jnp.where(jnp.arange(num_nodes) == source, 0, jnp.inf).astype(length.dtype)
     if edges.shape[0] == 0:
         return start

@@ -1,0 +1,264 @@
+"""One table of all public array functions, each under jit, vmap, padding and grad."""
+
+import inspect
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from blastjax import author, chunks, damage, fracture, graph, spatial
+from blastjax.core import Asset, Damage, State
+
+pytestmark = pytest.mark.usefixtures("strict")
+
+CLOSE = {"rtol": 2e-5, "atol": 2e-6}
+"""Float32 sums in another order."""
+SPARE = author.Capacity(
+    chunks=41, nodes=13, sub_chunks=24, bonds=29, has_world=True, depth=2, height=2
+)
+"""Every size is larger than what is needed, and different, to be told by."""
+
+
+def small():
+    """Eight boxes under a root, held at the bottom, each with two pieces."""
+    return author.shapes.grid(
+        (2, 2, 2), anchor=("z-",), root=True, pieces=(2, 1, 1), dtype=np.float32
+    )
+
+
+def worn(asset):
+    """Return a state with several actors of every kind."""
+    state = fracture.init(asset, 1.0, jnp.float32(0.8))
+    corner = jnp.array([0.5, 0.5, 1.5], jnp.float32)
+    opposite = jnp.array([-0.5, -0.5, 1.5], jnp.float32)
+    for place, amount in ((corner, 1.5), (corner, 1.0), (opposite, 1.5)):
+        hit = damage.falloff(asset, state, place, amount, 0.6, 0.7)
+        state, _ = fracture.step(asset, state, hit)
+    hit = damage.falloff(asset, state, corner, 0.4, 0.0, 2.5)
+    return fracture.step(asset, state, hit)[0]
+
+
+def worn_amounts(asset, state):
+    """Return damage to everything, the same for padded and unpadded."""
+    bond = 0.3 + 0.5 * jnp.abs(jnp.sin(7 * asset.bond_centroid.sum(1)))
+    place = chunks.element_values(asset, asset.chunk_centroid)
+    chunk = 1.5 * jnp.abs(jnp.sin(3 * place.sum(1)))
+    return Damage(bond=bond, chunk=jnp.where(chunks.is_chunk(asset), chunk, 0))
+
+
+AT = jnp.array([0.3, -0.2, 0.9], jnp.float32)
+TO = jnp.array([-0.5, 0.4, 1.6], jnp.float32)
+UP = jnp.array([0.0, 0.6, 0.8], jnp.float32)
+CORNERS = jnp.array([[-9, -8, 0.8], [9, -7, 1.1], [0.5, 9, 1.3]], jnp.float32)
+
+
+def some_actors(state):
+    return jnp.arange(state.actor.shape[0]) % 2 == 0
+
+
+def one_event(asset, state, event):
+    return damage.falloff(asset, state, event["at"], event["amount"], 0.2, 1.5)
+
+
+def full_buffer(x):
+    events = damage.buffer({"at": AT, "amount": jnp.float32(0)}, 2)
+    for i in range(3):
+        events = damage.push(events, {"at": AT + i, "amount": 0.4 * x})
+    return events
+
+
+# name: f(asset, state, x), where x is a scalar that real arguments scale with.
+TABLE = {
+    "chunks.active": lambda a, s, x: chunks.active(a, s),
+    "chunks.alone": lambda a, s, x: chunks.alone(a, s),
+    "chunks.can_fracture": lambda a, s, x: chunks.can_fracture(a, s),
+    "chunks.element_values": lambda a, s, x: chunks.element_values(
+        a, x * a.chunk_volume
+    ),
+    "chunks.has_children": lambda a, s, x: chunks.has_children(a),
+    "chunks.held": lambda a, s, x: chunks.held(a, s),
+    "chunks.is_chunk": lambda a, s, x: chunks.is_chunk(a),
+    "chunks.moments": lambda a, s, x: chunks.moments(a, s, 2.0 * x),
+    "chunks.node_count": lambda a, s, x: chunks.node_count(a, s),
+    "chunks.owner": lambda a, s, x: chunks.owner(a, s),
+    "chunks.split_required": lambda a, s, x: chunks.split_required(a, s),
+    "chunks.visible": lambda a, s, x: chunks.visible(a, s),
+    "damage.buffer": lambda a, s, x: damage.buffer({"at": AT * x}, 3),
+    "damage.capsule": lambda a, s, x: damage.capsule(a, s, AT * x, TO, x, 0.2, 1.5),
+    "damage.cutter": lambda a, s, x: damage.cutter(a, s, AT * x, x, 0.2, 1.5),
+    "damage.falloff": lambda a, s, x: damage.falloff(a, s, AT * x, x, 0.2, 1.5 * x),
+    "damage.impact_spread": lambda a, s, x: damage.impact_spread(
+        a, s, AT * x, x, 0.2 * x, 3.0
+    ),
+    "damage.normalize": lambda a, s, x: damage.normalize(
+        damage.Material(health=2.0, min_threshold=0.1, max_threshold=0.9), x
+    ),
+    "damage.push": lambda a, s, x: full_buffer(x),
+    "damage.restrict": lambda a, s, x: damage.restrict(
+        a,
+        s,
+        jax.tree.map(lambda y: x * y, worn_amounts(a, s)),
+        jnp.arange(s.actor.shape[0]) < 3,
+    ),
+    "damage.shear": lambda a, s, x: damage.shear(a, s, AT * x, UP, x, 0.2, 3.0),
+    "damage.triangle": lambda a, s, x: damage.triangle(a, s, CORNERS, x),
+    "fracture.apply": lambda a, s, x: fracture.apply(
+        a, s, jax.tree.map(lambda y: x * y, worn_amounts(a, s))
+    ),
+    "fracture.apply_buffer": lambda a, s, x: fracture.apply_buffer(
+        a, s, one_event, full_buffer(x)
+    ),
+    "fracture.deactivate": lambda a, s, x: fracture.deactivate(
+        a, s, jnp.arange(s.actor.shape[0]) == 2
+    ),
+    "fracture.init": lambda a, s, x: fracture.init(a, x, 0.5 * x),
+    "fracture.split": lambda a, s, x: fracture.split(
+        a, s.replace(bond_intact=s.bond_intact & (a.bond_centroid[:, 0] > -0.1))
+    ),
+    "fracture.step": lambda a, s, x: fracture.step(
+        a, s, jax.tree.map(lambda y: x * y, worn_amounts(a, s))
+    ),
+    "graph.group_any": lambda a, s, x: graph.group_any(
+        s.bond_intact, a.bond_nodes[:, 0], a.span_node.shape[0]
+    ),
+    "graph.group_sum": lambda a, s, x: graph.group_sum(
+        x * a.bond_area, a.bond_nodes[:, 0], a.span_node.shape[0]
+    ),
+    "graph.islands": lambda a, s, x: graph.islands(
+        a.bond_nodes, s.bond_intact, a.span_node.shape[0]
+    ),
+    "graph.shortest_ways": lambda a, s, x: graph.shortest_ways(
+        a.bond_nodes,
+        jnp.where(s.bond_intact, 1 + a.bond_area, jnp.inf),
+        jnp.int32(0),
+        jnp.float32(9.0),
+        a.span_node.shape[0],
+    ),
+    "spatial.conjugate": lambda a, s, x: spatial.conjugate(
+        spatial.unit(jnp.array([1, 2, 3], jnp.float32) * x)[jnp.array([0, 1, 2, 0])]
+    ),
+    "spatial.dot": lambda a, s, x: spatial.dot(AT * x, TO),
+    "spatial.norm": lambda a, s, x: spatial.norm(AT * x - AT),
+    "spatial.point_to_segment": lambda a, s, x: spatial.point_to_segment(AT * x, TO, UP),
+    "spatial.ratio": lambda a, s, x: spatial.ratio(x, x - 1),
+    "spatial.rotate": lambda a, s, x: spatial.rotate(
+        AT * x, jnp.array([0.5, -0.5, 0.5, 0.5], jnp.float32)
+    ),
+    "spatial.segment_hits_triangle": lambda a, s, x: spatial.segment_hits_triangle(
+        AT[None], TO[None] * x, CORNERS
+    ),
+    "spatial.unit": lambda a, s, x: spatial.unit(AT * x - AT),
+}
+MODULES = (chunks, damage, fracture, graph, spatial)
+
+
+def test_table_is_complete():
+    public = {
+        f"{module.__name__.split('.')[-1]}.{name}"
+        for module in MODULES
+        for name, f in inspect.getmembers(module, inspect.isfunction)
+        if not name.startswith("_") and f.__module__ == module.__name__
+    }
+    assert public == set(TABLE)
+
+
+@pytest.fixture(scope="module")
+def sample():
+    asset = small()
+    return asset, jax.jit(worn)(asset)
+
+
+def same(ours, theirs):
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, **CLOSE), ours, theirs)
+
+
+ONE = jnp.float32(1.0)
+
+
+def test_sample_has_actors_of_every_kind(sample):
+    asset, state = sample
+    nodes = asset.span_node.shape[0]
+    active = np.asarray(chunks.active(asset, state))
+    alone = np.asarray(chunks.alone(asset, state))
+    assert active[0]
+    assert not alone[0]
+    assert alone[:nodes].any()
+    assert active[nodes:].any()
+
+
+@pytest.mark.parametrize("name", TABLE)
+def test_jit_is_eager(name, sample):
+    same(jax.jit(TABLE[name])(*sample, ONE), TABLE[name](*sample, ONE))
+
+
+@pytest.mark.parametrize("name", TABLE)
+def test_vmap_is_a_loop(name, sample):
+    """Over different states, and over different assets as well."""
+    asset, state = sample
+    other = jax.tree.map(lambda x: x, asset).replace(
+        bond_nodes=jnp.where(asset.bond_nodes == 2, 3, asset.bond_nodes)
+    )
+    fresh = fracture.init(asset, jnp.ones(asset.bond_area.shape), jnp.float32(0.8))
+    fresh = jax.tree.map(lambda x, y: jnp.asarray(y, x.dtype), state, fresh.replace(
+        bond_unbreakable=state.bond_unbreakable))
+    assets = jax.tree.map(lambda *x: jnp.stack(x), asset, other)
+    states = jax.tree.map(lambda *x: jnp.stack(x), state, fresh)
+    xs = jnp.array([1.0, 0.8], jnp.float32)
+    f = jax.jit(TABLE[name])
+    for batch, axis in ((states, None), (states, 0)):
+        shared = asset if axis is None else assets
+        many = jax.jit(jax.vmap(TABLE[name], (axis, 0, 0)))(shared, batch, xs)
+        for i, (a, s) in enumerate([(asset, state), (other, fresh)]):
+            one = f(asset if axis is None else a, s, xs[i])
+            same(jax.tree.map(lambda x, i=i: x[i], many), one)
+
+
+def cut_back(tree, asset: Asset):
+    """Take padding out of a result, telling by the sizes what has which."""
+    own = author.capacity(asset)
+    nodes, subs = own.nodes, own.sub_chunks
+    elements = np.r_[np.arange(nodes), np.arange(subs) + SPARE.nodes]
+    rows = {
+        SPARE.nodes + SPARE.sub_chunks: elements,
+        SPARE.chunks: np.arange(own.chunks),
+        SPARE.nodes: np.arange(nodes),
+        SPARE.bonds: np.arange(own.bonds),
+    }
+    assert len(rows) == 4
+
+    def cut(x):
+        x = np.asarray(x)
+        x = x[rows[len(x)]] if x.ndim and len(x) in rows else x
+        if x.dtype.kind == "i":
+            x = np.where(x >= SPARE.nodes, x - SPARE.nodes + nodes, x)
+        return x
+
+    return jax.tree.map(cut, tree)
+
+
+@pytest.mark.parametrize("name", TABLE)
+def test_padding_changes_nothing(name, sample):
+    asset, state = sample
+    padded = author.pad(asset, SPARE)
+    worn_padded = jax.jit(worn)(padded)
+    same(cut_back(worn_padded, asset), state)
+    found = jax.jit(TABLE[name])(padded, worn_padded, ONE)
+    same(cut_back(found, asset), jax.jit(TABLE[name])(*sample, ONE))
+
+
+@pytest.mark.parametrize("name", TABLE)
+def test_gradients_are_finite(name, sample):
+    """With respect to everything real that goes in, ties and zeros among it."""
+    asset, state = sample
+
+    def total(asset: Asset, state: State, x):
+        out = TABLE[name](asset, state, x)
+        reals = [y for y in jax.tree.leaves(out) if jnp.issubdtype(y.dtype, jnp.floating)]
+        # Unreached is infinitely far; that is no number to sum.
+        return sum(jnp.sum(jnp.where(jnp.isfinite(y), y, 0)) for y in reals) + 0 * x
+
+    slopes = jax.jit(jax.grad(total, (0, 1, 2), allow_int=True))(asset, state, ONE)
+    for path, slope in jax.tree_util.tree_leaves_with_path(slopes):
+        if slope.dtype != jax.dtypes.float0:
+            assert np.isfinite(slope).all(), jax.tree_util.keystr(path)
