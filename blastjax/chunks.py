@@ -76,7 +76,7 @@ def alone(asset: Asset, state: State) -> jax.Array:
 
 def held(asset: Asset, state: State) -> jax.Array:
     """Return which actors the world holds, (A,) bool by label."""
-    first = jnp.arange(state.actor.shape[0]) == 0
+    first = jnp.arange(state.actor.shape[0], dtype=jnp.int32) == 0
     return active(asset, state) & first & asset.has_world
 
 

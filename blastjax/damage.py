@@ -147,7 +147,7 @@ def shear(
     profile = _falloff(asset, amount, min_radius, max_radius)
     start, single = _closest(asset, state, position, actors)
     found = start != NONE
-    only = jnp.arange(state.actor.shape[0]) == start
+    only = jnp.arange(state.actor.shape[0], dtype=jnp.int32) == start
 
     centroid = chunks.element_values(asset, asset.chunk_centroid)
     at_chunk = profile(_distance(centroid, position))
@@ -189,7 +189,7 @@ def impact_spread(
     amount, low, high = _scalars(asset, amount, min_radius, max_radius)
     profile = _falloff(asset, 1.0, low, high)
     start, single = _closest(asset, state, position, actors)
-    only = jnp.arange(state.actor.shape[0]) == start
+    only = jnp.arange(state.actor.shape[0], dtype=jnp.int32) == start
     chunk = jnp.where(only & single, amount, 0)
 
     first, second = asset.bond_nodes[:, 0], asset.bond_nodes[:, 1]
@@ -381,7 +381,7 @@ def _closest(
             near = near & (second != 0)
         offset = _rows(position, asset.bond_centroid) - asset.bond_centroid
         square = jnp.where(near, spatial.dot(offset, offset), jnp.inf)
-        bond = jnp.argmin(square)
+        bond = jnp.argmin(square).astype(jnp.int32)
         below = spatial.dot(offset[bond], asset.bond_normal[bond]) < 0
         side = jnp.where(below, first[bond], second[bond])
         nearest = jnp.where(near[bond] & ~alone, side, nearest)

@@ -66,7 +66,7 @@ def init(
         for _ in range(asset.depth):
             chunk = jnp.where(asset.element_parent >= 0, chunk[parent], chunk)
 
-    in_graph = jnp.arange(capacity) < num_nodes
+    in_graph = jnp.arange(capacity, dtype=jnp.int32) < num_nodes
     belongs = in_graph & real_chunk
     label = jnp.zeros((), jnp.int32)
     if asset.has_world:

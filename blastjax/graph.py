@@ -61,7 +61,9 @@ def shortest_ways(
       (N,) lengths, infinite where no way leads. Constant under differentiation.
     """
     length, limit = jax.lax.stop_gradient((length, limit))
-    start = jnp.where(jnp.arange(num_nodes) == source, 0, jnp.inf).astype(length.dtype)
+    start = jnp.where(
+        jnp.arange(num_nodes, dtype=jnp.int32) == source, 0, jnp.inf
+    ).astype(length.dtype)
     if edges.shape[0] == 0:
         return start
     near = jnp.concatenate([edges[:, 0], edges[:, 1]])

@@ -1,10 +1,10 @@
 """Replay recorded Blast data: `python -m tests.golden lowlevel|desc FILE.npz`.
 
 Every case goes two ways: through the public library, compared at level 1 (partition,
-visible chunks, flags, healths, damage), and through the plain-Python reference, compared
-to the last bit and list order, so that no number of a file goes unread. The last line
-counts mismatches and, by name, where the library differs from Blast on purpose; the exit
-code is 0 only if there are no mismatches.
+visible chunks, flags, healths, damage), and through the plain-Python reference,
+compared to the last bit and list order, so that no number of a file goes unread. The
+last line counts mismatches and, by name, where the library differs from Blast on
+purpose; the exit code is 0 only if there are no mismatches.
 """
 
 import argparse
@@ -25,7 +25,11 @@ def lowlevel(path):
 def desc(path):
     """Yield (case number, mismatches, differences) of a recording of descriptors."""
     for case in recorded.desc_cases(path):
-        yield case["desc_id"], conformance.check_desc(case) + replay.verify_desc(case), {}
+        yield (
+            case["desc_id"],
+            conformance.check_desc(case) + replay.verify_desc(case),
+            {},
+        )
 
 
 KINDS = {"lowlevel": lowlevel, "desc": desc}

@@ -1,4 +1,4 @@
-"""Random assets and damage, run through the reference: cases as a recording has them."""
+"""Random assets and damage, run through the reference, as a recording has them."""
 
 import numpy as np
 
@@ -8,8 +8,12 @@ from tests.replay import _parameters as parameters
 
 # A few sizes, since every size costs a compilation: chunks above the support level,
 # support chunks, chunks below it, bonds, the world among them.
-SIZES = ((0, 1, 0, 0, False), (1, 3, 4, 3, True), (3, 8, 9, 12, False),
-         (2, 12, 0, 24, True))
+SIZES = (
+    (0, 1, 0, 0, False),
+    (1, 3, 4, 3, True),
+    (3, 8, 9, 12, False),
+    (2, 12, 0, 24, True),
+)
 
 
 def random_case(seed, size, rounds=3):
@@ -98,7 +102,7 @@ def random_case(seed, size, rounds=3):
 
 
 def random_descriptions(rng, supers, supports, subs, bonds, world):
-    """Describe a random hierarchy and support graph, shuffled, flags not always exact."""
+    """Describe a random hierarchy and support graph, shuffled, flags often inexact."""
     parent = [rng.integers(-1, i) if i else -1 for i in range(supers)]
     for _ in range(supports):
         parent.append(rng.integers(0, supers) if supers else -1)

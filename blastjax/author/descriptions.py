@@ -90,7 +90,7 @@ def checked_chunks(chunks: Chunks) -> Chunks:
     else:
         size = reals("chunk size", chunks.size, (count, 3))
         refuse(
-            (size < 0).any(axis=1),
+            np.any(size < 0, axis=1),
             size,
             "chunk {i} has size {v}; half extents are zero or more, in m",
         )

@@ -6,6 +6,7 @@ bonds that join node 0 to itself.
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -73,9 +74,9 @@ def pad(asset: Asset, to: Capacity) -> Asset:
         if room < 1 and name in ("chunks", "nodes"):
             raise ValueError(f"the capacity has {name}={room}; it must be 1 or more")
 
-    asset = jax.tree.map(np.asarray, asset)
-    shift = int(to.has_world and not asset.has_world)
-    old_nodes, old_elements = len(asset.span_node), len(asset.element_chunk)
+    host: Any = jax.tree.map(np.asarray, asset)
+    shift = int(to.has_world and not host.has_world)
+    old_nodes, old_elements = len(host.span_node), len(host.element_chunk)
     # Where each old element goes.
     place = np.concatenate(
         [
@@ -98,25 +99,25 @@ def pad(asset: Asset, to: Capacity) -> Asset:
         rows[place] = x
         return jnp.asarray(rows)
 
-    in_spans = asset.span_node[: old_nodes - asset.has_world] + shift
+    in_spans = host.span_node[: old_nodes - host.has_world] + shift
     others = np.setdiff1d(np.arange(to.nodes), in_spans)
     span_node = np.concatenate([in_spans, others]).astype(np.int32)
     return Asset(
-        chunk_parent=grown(asset.chunk_parent, to.chunks, NO_PARENT),
-        chunk_children=grown(asset.chunk_children, to.chunks),
-        chunk_centroid=grown(asset.chunk_centroid, to.chunks),
-        chunk_volume=grown(asset.chunk_volume, to.chunks),
-        chunk_inertia=grown(asset.chunk_inertia, to.chunks),
-        chunk_size=grown(asset.chunk_size, to.chunks),
-        chunk_element=grown(renamed(asset.chunk_element), to.chunks, NONE),
-        chunk_span=grown(asset.chunk_span, to.chunks),
+        chunk_parent=grown(host.chunk_parent, to.chunks, NO_PARENT),
+        chunk_children=grown(host.chunk_children, to.chunks),
+        chunk_centroid=grown(host.chunk_centroid, to.chunks),
+        chunk_volume=grown(host.chunk_volume, to.chunks),
+        chunk_inertia=grown(host.chunk_inertia, to.chunks),
+        chunk_size=grown(host.chunk_size, to.chunks),
+        chunk_element=grown(renamed(host.chunk_element), to.chunks, NONE),
+        chunk_span=grown(host.chunk_span, to.chunks),
         span_node=jnp.asarray(span_node),
-        element_chunk=moved(asset.element_chunk, NO_WORLD if shift else NONE),
-        element_parent=moved(renamed(asset.element_parent)),
-        bond_nodes=grown(asset.bond_nodes + np.int32(shift), to.bonds),
-        bond_normal=grown(asset.bond_normal, to.bonds),
-        bond_centroid=grown(asset.bond_centroid, to.bonds),
-        bond_area=grown(asset.bond_area, to.bonds),
+        element_chunk=moved(host.element_chunk, NO_WORLD if shift else NONE),
+        element_parent=moved(renamed(host.element_parent)),
+        bond_nodes=grown(host.bond_nodes + np.int32(shift), to.bonds),
+        bond_normal=grown(host.bond_normal, to.bonds),
+        bond_centroid=grown(host.bond_centroid, to.bonds),
+        bond_area=grown(host.bond_area, to.bonds),
         has_world=to.has_world,
         depth=to.depth,
         height=to.height,
