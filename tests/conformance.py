@@ -86,7 +86,9 @@ def compiled():
 def bucket(need):
     """Return one of a few capacities that holds this one."""
     size = max(need.nodes, need.sub_chunks, need.chunks / 2, need.bonds / 4, 16)
-    size = 32 if size <= 32 else 160 if size <= 160 else int(2 ** np.ceil(np.log2(size)))
+    size = (
+        32 if size <= 32 else 160 if size <= 160 else int(2 ** np.ceil(np.log2(size)))
+    )
     return author.Capacity(
         chunks=2 * size,
         nodes=size,
@@ -154,7 +156,9 @@ class Replay:
             case["raw_bond_area"],
             case["raw_bond_centroid"],
         )
-        expect("raw accepted", accepts(raw, raw_bonds), bool(case["case_create_raw_ok"]))
+        expect(
+            "raw accepted", accepts(raw, raw_bonds), bool(case["case_create_raw_ok"])
+        )
 
         covered, exact = author.ensure_coverage(parent, support)
         expect("coverage exact", exact, bool(case["case_cov_ret"]))
@@ -179,7 +183,11 @@ class Replay:
         expect("reordered normals", normal, case["re_bond_normal"])
 
         built = author.build(
-            moved, bonds, strict=True, drop_invalid_bonds=True, orient_normals=False,
+            moved,
+            bonds,
+            strict=True,
+            drop_invalid_bonds=True,
+            orient_normals=False,
             dtype=np.float32,
         )
         whole = author.build(raw, raw_bonds, drop_invalid_bonds=True)
@@ -199,7 +207,10 @@ class Replay:
         expect("centroids", asset.chunk_centroid, case["chunk_centroid"])
         expect("volumes", asset.chunk_volume, case["chunk_volume"])
         expect("userdata", case["raw_chunk_userdata"][old], case["chunk_userdata"])
-        first, stop = signed(case["chunk_first_child"]), signed(case["chunk_child_stop"])
+        first, stop = (
+            signed(case["chunk_first_child"]),
+            signed(case["chunk_child_stop"]),
+        )
         expect("children", asset.chunk_children, stop - first)
         leaves = np.where(asset.chunk_children == 0, 1, 0)
         for i in range(len(leaves) - 1, -1, -1):
@@ -469,7 +480,9 @@ def check_desc(case):
             expect("raw order", ordered, bool(case["desc_map_raw_ret"]))
             expect("raw map", raw_map, case["desc_map_raw"])
         except ValueError:
-            expect("raw map refused", True, bool((case["desc_map_raw"] == 0xDEAD).all()))
+            expect(
+                "raw map refused", True, bool((case["desc_map_raw"] == 0xDEAD).all())
+            )
             expect("raw order", False, bool(case["desc_map_raw_ret"]))
         covered, exact = author.ensure_coverage(parent, support)
         expect("coverage exact", exact, bool(case["desc_cov_ret"]))

@@ -3,8 +3,7 @@
 import numpy as np
 
 from tests import reference
-from tests.replay import KINDS
-from tests.replay import _parameters as parameters
+from tests.replay import KINDS, parameters
 
 # A few sizes, since every size costs a compilation: chunks above the support level,
 # support chunks, chunks below it, bonds, the world among them.

@@ -18,9 +18,7 @@ EXAMPLES = 500
     deadline=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
-@given(
-    seed=st.integers(0, 2**32 - 1), size=st.sampled_from(random_cases.SIZES)
-)
+@given(seed=st.integers(0, 2**32 - 1), size=st.sampled_from(random_cases.SIZES))
 def test_agrees_with_reference(padded, seed, size):
     case = random_cases.random_case(seed, size)
     replay = conformance.Replay(case, padded=padded).run()

@@ -26,8 +26,17 @@ def changed(value):
 
 @pytest.mark.parametrize(
     "column",
-    ["bcmd_health", "actor_vis", "state_bond_health", "adj_node", "split_child",
-     "op_can_fracture", "chunk_leaf_count", "reorder_map", "raw_bond_area"],
+    [
+        "bcmd_health",
+        "actor_vis",
+        "state_bond_health",
+        "adj_node",
+        "split_child",
+        "op_can_fracture",
+        "chunk_leaf_count",
+        "reorder_map",
+        "raw_bond_area",
+    ],
 )
 def test_changed_number_is_noticed(column, tmp_path):
     with np.load(DATA / "lowlevel.npz") as file:

@@ -140,7 +140,9 @@ TABLE = {
     ),
     "spatial.dot": lambda a, s, x: spatial.dot(AT * x, TO),
     "spatial.norm": lambda a, s, x: spatial.norm(AT * x - AT),
-    "spatial.point_to_segment": lambda a, s, x: spatial.point_to_segment(AT * x, TO, UP),
+    "spatial.point_to_segment": lambda a, s, x: spatial.point_to_segment(
+        AT * x, TO, UP
+    ),
     "spatial.ratio": lambda a, s, x: spatial.ratio(x, x - 1),
     "spatial.rotate": lambda a, s, x: spatial.rotate(
         AT * x, jnp.array([0.5, -0.5, 0.5, 0.5], jnp.float32)
@@ -200,8 +202,11 @@ def test_vmap_is_a_loop(name, sample):
         bond_nodes=jnp.where(asset.bond_nodes == 2, 3, asset.bond_nodes)
     )
     fresh = fracture.init(asset, jnp.ones(asset.bond_area.shape), jnp.float32(0.8))
-    fresh = jax.tree.map(lambda x, y: jnp.asarray(y, x.dtype), state, fresh.replace(
-        bond_unbreakable=state.bond_unbreakable))
+    fresh = jax.tree.map(
+        lambda x, y: jnp.asarray(y, x.dtype),
+        state,
+        fresh.replace(bond_unbreakable=state.bond_unbreakable),
+    )
     assets = jax.tree.map(lambda *x: jnp.stack(x), asset, other)
     states = jax.tree.map(lambda *x: jnp.stack(x), state, fresh)
     xs = jnp.array([1.0, 0.8], jnp.float32)
@@ -254,7 +259,9 @@ def test_gradients_are_finite(name, sample):
 
     def total(asset: Asset, state: State, x):
         out = TABLE[name](asset, state, x)
-        reals = [y for y in jax.tree.leaves(out) if jnp.issubdtype(y.dtype, jnp.floating)]
+        reals = [
+            y for y in jax.tree.leaves(out) if jnp.issubdtype(y.dtype, jnp.floating)
+        ]
         # Unreached is infinitely far; that is no number to sum.
         return sum(jnp.sum(jnp.where(jnp.isfinite(y), y, 0)) for y in reals) + 0 * x
 
