@@ -114,7 +114,9 @@ def triangle(
     if asset.depth:
         here = asset.chunk_centroid
         after = jnp.concatenate([here[1:], here[-1:]])
-        hit = spatial.segment_hits_triangle(here, after, corners)
+        # Behind the last child there is no chunk, or padding: both look like a root.
+        follows = jnp.append(asset.chunk_parent[1:], NONE) >= 0
+        hit = follows & spatial.segment_hits_triangle(here, after, corners)
         parent_hit = graph.group_any(hit, asset.chunk_parent, here.shape[0])
         hit = chunks.element_values(asset, parent_hit)
         chunk = _on_chunks(asset, state, jnp.where(hit, amount, 0))
