@@ -1,0 +1,23 @@
+"""Breaking bodies in MJX: an actor is one free body, its chunks are geoms it borrows.
+
+MJX fixes the tree of bodies when a model is compiled; a thing that breaks has no fixed
+tree. So a scene holds K *slots*, free bodies without geoms, and one mocap body with
+one geom for every chunk. Which slot carries which chunk is data: at each step the
+chunks of an actor are placed by its slot, and a contact on a chunk acts on that slot's
+six degrees of freedom. What the world holds acts on the world itself. Rigidity is
+therefore exact, and the constraint solver sees 6 K unknowns however many chunks there
+are.
+
+| module | job |
+|---|---|
+| `scene` | host: MJCF from an asset and the user's own model, with all validation |
+| `bodies` | which actor rides in which slot, and where that puts its chunks |
+| `contact` | pairs, manifolds and caps; forces and impulses on the chunks |
+| `solver` | the contact problem, by Newton's method with an implicit derivative |
+| `engine` | the only tie to MJX's private functions; a canary test watches it |
+"""
+
+from blastjax.rigid import bodies, contact, engine, scene, solver
+from blastjax.rigid.scene import Scene, build
+
+__all__ = ["Scene", "bodies", "build", "contact", "engine", "scene", "solver"]

@@ -1,0 +1,333 @@
+"""Which actor rides in which slot, and where that puts its chunks.
+
+A slot's frame has the asset's rest axes and its origin at the actor's centre of mass,
+so a chunk sits at (centroid - centre of mass) in it, without rotation. Index K stands
+for what the world holds; its frame is the asset's placement. Sizes: K slots, A
+elements.
+"""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+from mujoco import mjx
+
+from blastjax import chunks, pytree, spatial
+from blastjax.core import NONE, SplitEvents, State
+from blastjax.rigid import engine
+from blastjax.rigid.scene import Scene
+
+UNMEASURED = 1e3
+"""Overlap of pieces that have not collided since their split, m."""
+PARKED = (0.0, 0.0, -1000.0)
+"""Where the geoms of chunks that belong to no actor wait, m."""
+
+
+@pytree.dataclass
+class Bodies(pytree.Node):
+    """The slots and who rides in them."""
+
+    slot: jax.Array
+    """(A,) int32 slot of each element, K for the world's, NONE for no actor's."""
+    label: jax.Array
+    """(K,) int32 actor in each slot, NONE in an empty one."""
+    mass: jax.Array
+    """(K,) kg; 1 in an empty slot."""
+    center: jax.Array
+    """(K, 3) centre of mass in the rest frame, m."""
+    inertia: jax.Array
+    """(K, 3, 3) about the centre of mass, rest axes, kg m^2; 1 in an empty slot."""
+    grace: jax.Array
+    """(K + 1, K + 1) int32 steps for which two slots still do not collide."""
+    overlap: jax.Array
+    """(K + 1, K + 1) depth to which two slots may overlap, m: see `contact`."""
+
+
+@pytree.dataclass
+class Frames(pytree.Node):
+    """Pose and motion of the slots, the world's last."""
+
+    position: jax.Array
+    """(K + 1, 3) of the centre of mass, m."""
+    quaternion: jax.Array
+    """(K + 1, 4)."""
+    center: jax.Array
+    """(K + 1, 3) the same point in the rest frame, m."""
+    velocity: jax.Array
+    """(K + 1, 3) of the centre of mass, m/s."""
+    spin: jax.Array
+    """(K + 1, 3) angular velocity in the slot's own axes, rad/s."""
+
+
+def nobody(scene: Scene) -> Bodies:
+    """Return empty slots."""
+    slots, elements = scene.slots, scene.asset.element_chunk.shape[0]
+    dtype = scene.position.dtype
+    return Bodies(
+        slot=jnp.full(elements, NONE, jnp.int32),
+        label=jnp.full(slots, NONE, jnp.int32),
+        mass=jnp.ones(slots, dtype),
+        center=jnp.zeros((slots, 3), dtype),
+        inertia=jnp.broadcast_to(jnp.eye(3, dtype=dtype), (slots, 3, 3)),
+        grace=jnp.zeros((slots + 1, slots + 1), jnp.int32),
+        overlap=jnp.zeros((slots + 1, slots + 1), dtype),
+    )
+
+
+def frames(scene: Scene, bodies: Bodies, data: mjx.Data) -> Frames:
+    """Read where the slots are and how they move."""
+    pose, motion = data.qpos[scene.host.slot_qpos], data.qvel[scene.host.slot_dof]
+    still = jnp.zeros((1, 3), pose.dtype)
+    # An orientation is stored unnormalised and read normalised, as MuJoCo does.
+    turn = pose[:, 3:]
+    square = jnp.sum(turn * turn, axis=1, keepdims=True)
+    turn = turn * jax.lax.rsqrt(jnp.where(square > 0, square, 1.0))
+    return Frames(
+        position=jnp.concatenate([pose[:, :3], scene.position[None]]),
+        quaternion=jnp.concatenate([turn, scene.quaternion[None]]),
+        center=jnp.concatenate([bodies.center, still]),
+        velocity=jnp.concatenate([motion[:, :3], still]),
+        spin=jnp.concatenate([motion[:, 3:], still]),
+    )
+
+
+def to_world(frames: Frames, slot: jax.Array, point: jax.Array) -> jax.Array:
+    """Map rest-frame points (n, 3), carried by slots (n,), into the world."""
+    arm = spatial.rotate(point - frames.center[slot], frames.quaternion[slot])
+    return frames.position[slot] + arm
+
+
+def to_rest(frames: Frames, slot: jax.Array, point: jax.Array) -> jax.Array:
+    """Map world points (n, 3), seen from slots (n,), into the rest frame."""
+    back = spatial.conjugate(frames.quaternion[slot])
+    return frames.center[slot] + spatial.rotate(point - frames.position[slot], back)
+
+
+def chunk_poses(
+    scene: Scene, bodies: Bodies, data: mjx.Data
+) -> tuple[jax.Array, jax.Array]:
+    """Return where each element's chunk is: (A, 3) m, and its orientation (A, 4).
+
+    Chunks that belong to no actor are parked far below.
+    """
+    seen = frames(scene, bodies, data)
+    rest = chunks.element_values(scene.asset, scene.asset.chunk_centroid)
+    here = (bodies.slot != NONE)[:, None]
+    slot = jnp.maximum(bodies.slot, 0)
+    parked = jnp.asarray(PARKED, rest.dtype)[None]
+    position = jnp.where(here, to_world(seen, slot, rest), parked)
+    return position, seen.quaternion[slot]
+
+
+def place(scene: Scene, bodies: Bodies, data: mjx.Data) -> mjx.Data:
+    """Put every chunk's mocap body where its actor has it."""
+    position, quaternion = chunk_poses(scene, bodies, data)
+    host = scene.host
+    return data.replace(
+        mocap_pos=data.mocap_pos.at[host.mocap].set(position[host.element]),
+        mocap_quat=data.mocap_quat.at[host.mocap].set(quaternion[host.element]),
+    )
+
+
+def weigh(scene: Scene, bodies: Bodies) -> mjx.Model:
+    """Return the model with the actors' masses in their slots."""
+    body = scene.host.slot_body
+    mass, inertia = bodies.mass, bodies.inertia
+    # Contacts are as soft as the inverse inertias of the bodies say.
+    inverse = jnp.trace(_inverse(inertia), axis1=1, axis2=2) / 3.0
+    softness = jnp.stack([1.0 / mass, inverse], axis=1)
+    model = scene.model
+    return model.replace(
+        body_mass=model.body_mass.at[body].set(mass),
+        body_invweight0=model.body_invweight0.at[body].set(softness),
+    )
+
+
+def kinematics(
+    scene: Scene, model: mjx.Model, bodies: Bodies, data: mjx.Data
+) -> mjx.Data:
+    """Place every body and compute the inertia of the whole, actors included."""
+    data = engine.kinematics(model, data)
+    data = engine.set_inertia(data, scene.host.slot_body, bodies.mass, bodies.inertia)
+    return engine.factor_inertia(model, data)
+
+
+def empty_dofs(scene: Scene, bodies: Bodies) -> jax.Array:
+    """Return the degrees of freedom of empty slots, (V,) bool."""
+    empty = jnp.broadcast_to((bodies.label == NONE)[:, None], scene.host.slot_dof.shape)
+    return jnp.zeros(scene.model.nv, bool).at[scene.host.slot_dof].set(empty)
+
+
+def outcasts(scene: Scene, state: State) -> jax.Array:
+    """Return the actors too light for a slot, (A,) bool by label.
+
+    The K heaviest that the world does not hold have one; among equals, the smaller
+    label.
+    """
+    order, weight = _ranking(scene, state)
+    kept = jnp.zeros(weight.shape[0], bool).at[order].set(True)
+    return (weight > 0) & ~kept
+
+
+def reassign(
+    scene: Scene,
+    bodies: Bodies,
+    data: mjx.Data,
+    state: State,
+    parted: SplitEvents,
+    grace_steps: int | jax.Array,
+) -> tuple[Bodies, mjx.Data]:
+    """Give every actor a slot and the motion that its parent had at that place.
+
+    An actor's heaviest heir keeps its slot, the others take the lowest free slots,
+    heavier first. Momentum, angular momentum and energy are those of the parent's rigid
+    motion. What the world lets go starts at rest.
+
+    Args:
+      scene: the scene.
+      bodies: slots before the split.
+      data: positions and velocities before it.
+      state: after the split; at most K moving actors (see `outcasts`).
+      parted: what the split did.
+      grace_steps: for so many steps the pieces of one actor do not collide.
+    """
+    capacity, slots = state.actor.shape[0], scene.slots
+    moments = chunks.moments(scene.asset, state, scene.density)
+    order, weight = _ranking(scene, state)
+    live = weight[order] > 0
+    parent = parted.parent[order]
+    origin = jnp.where(parent != NONE, bodies.slot[jnp.maximum(parent, 0)], NONE)
+    origin = jnp.where(live, origin, NONE)
+    slot = _assign(origin, live, slots)
+
+    # Slots look up their actor: index K of these tables is the place for nobody.
+    where = jnp.where(live, slot, slots)
+    rank = jnp.full(slots, slots, jnp.int32)
+    rank = rank.at[where].set(jnp.arange(slots, dtype=jnp.int32), mode="drop")
+    used = rank < slots
+    rank = jnp.minimum(rank, slots - 1)
+    label = jnp.where(used, order[rank], NONE)
+    origin = jnp.where(used, origin[rank], NONE)
+    pick = jnp.maximum(label, 0)
+    eye = jnp.eye(3, dtype=moments.inertia.dtype)
+    now = bodies.replace(
+        slot=_element_slots(scene, state, label, capacity),
+        label=label,
+        mass=jnp.where(used, moments.mass[pick], 1.0),
+        center=jnp.where(used[:, None], moments.center[pick], bodies.center),
+        inertia=jnp.where(used[:, None, None], moments.inertia[pick], eye),
+    )
+    created = used & parted.created[pick]
+    # What the world holds has a place in the tables too, and is its own heir.
+    holder = parted.created[0] if scene.asset.has_world else False
+    family = jnp.append(origin, slots), jnp.append(created, holder)
+    now = now.replace(
+        grace=_pass_on(bodies.grace, *family, grace_steps),
+        overlap=_pass_on(bodies.overlap, *family, UNMEASURED),
+    )
+    return now, _inherit(scene, bodies, now, data, origin, created)
+
+
+def settle(bodies: Bodies) -> Bodies:
+    """Let one step of grace pass."""
+    return bodies.replace(grace=jnp.maximum(bodies.grace - 1, 0))
+
+
+def host_data(scene: Scene, bodies: Bodies, data: mjx.Data) -> mujoco.MjData:
+    """Return the same moment in MuJoCo C, for rendering: one world, not a batch."""
+    placed = place(scene, bodies, data)
+    out = mujoco.MjData(scene.host.model)
+    for name in ("qpos", "qvel", "act", "ctrl", "mocap_pos", "mocap_quat"):
+        getattr(out, name)[:] = jax.device_get(getattr(placed, name))
+    out.time = float(data.time)
+    mujoco.mj_kinematics(scene.host.model, out)
+    mujoco.mj_comPos(scene.host.model, out)
+    mujoco.mj_camlight(scene.host.model, out)
+    return out
+
+
+def _inverse(matrix: jax.Array) -> jax.Array:
+    """Invert (K, 3, 3) by cofactors: cheap, and differentiable."""
+    a, b, c = matrix[:, 0], matrix[:, 1], matrix[:, 2]
+    cofactors = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)], axis=-1)
+    return cofactors / spatial.dot(a, jnp.cross(b, c))[:, None, None]
+
+
+def _ranking(scene: Scene, state: State) -> tuple[jax.Array, jax.Array]:
+    """Return the K heaviest moving actors, (K,) labels, and all weights (A,) or 0."""
+    moments = chunks.moments(scene.asset, state, scene.density)
+    moving = chunks.active(scene.asset, state) & ~chunks.held(scene.asset, state)
+    weight = jax.lax.stop_gradient(jnp.where(moving, moments.mass, 0.0))
+    _, order = jax.lax.top_k(weight, scene.slots)
+    return order.astype(jnp.int32), weight
+
+
+def _assign(origin: jax.Array, live: jax.Array, slots: int) -> jax.Array:
+    """Return the slot (K,) of actors in order of weight, from their parents' slots."""
+    index = jnp.arange(slots, dtype=jnp.int32)
+    could = live & (origin >= 0) & (origin < slots)
+    earlier = (index[None, :] < index[:, None]) & could[None, :]
+    beaten = jnp.any(earlier & (origin[None, :] == origin[:, None]), axis=1)
+    keeps = could & ~beaten
+    taken = jnp.any(keeps[:, None] & (origin[:, None] == index[None, :]), axis=0)
+    free = jnp.argsort(taken, stable=True).astype(jnp.int32)
+    turn = jnp.cumsum((live & ~keeps).astype(jnp.int32)) - 1
+    return jnp.where(keeps, origin, free[jnp.maximum(turn, 0)])
+
+
+def _element_slots(
+    scene: Scene, state: State, label: jax.Array, capacity: int
+) -> jax.Array:
+    slots = scene.slots
+    # Empty slots write out of range, which drops them.
+    at = jnp.where(label == NONE, capacity, label)
+    table = jnp.full(capacity, NONE, jnp.int32)
+    table = table.at[at].set(jnp.arange(slots, dtype=jnp.int32), mode="drop")
+    if scene.asset.has_world:
+        table = table.at[0].set(slots)
+    return jnp.where(state.actor == NONE, NONE, table[jnp.maximum(state.actor, 0)])
+
+
+def _pass_on(
+    table: jax.Array,
+    origin: jax.Array,
+    created: jax.Array,
+    fresh: int | float | jax.Array,
+) -> jax.Array:
+    """Give children their parents' entries (K + 1, K + 1), siblings a fresh one."""
+    known = (origin[:, None] != NONE) & (origin[None, :] != NONE)
+    parent = jnp.maximum(origin, 0)
+    inherited = table[parent][:, parent]
+    siblings = (origin[:, None] == origin[None, :]) & (
+        created[:, None] | created[None, :]
+    )
+    entries = jnp.where(siblings, jnp.asarray(fresh, table.dtype), inherited)
+    return jnp.where(known & ~jnp.eye(len(origin), dtype=bool), entries, 0)
+
+
+def _inherit(
+    scene: Scene,
+    before: Bodies,
+    after: Bodies,
+    data: mjx.Data,
+    origin: jax.Array,
+    created: jax.Array,
+) -> mjx.Data:
+    used = (origin != NONE)[:, None]
+    seen = frames(scene, before, data)
+    parent = jnp.maximum(origin, 0)
+    turn, spin = seen.quaternion[parent], seen.spin[parent]
+    arm = spatial.rotate(after.center - seen.center[parent], turn)
+    velocity = seen.velocity[parent] + jnp.cross(spatial.rotate(spin, turn), arm)
+    pose = jnp.concatenate([seen.position[parent] + arm, turn], axis=1)
+    motion = jnp.concatenate([velocity, spin], axis=1)
+    qpos, dof = scene.host.slot_qpos, scene.host.slot_dof
+    # An actor that no split touched must not even be rounded.
+    moved = used & (created | (origin != jnp.arange(scene.slots)))[:, None]
+    pose = jnp.where(moved, pose, data.qpos[qpos])
+    motion = jnp.where(moved, motion, jnp.where(used, data.qvel[dof], 0.0))
+    warm = jnp.where(moved | ~used, 0.0, data.qacc_warmstart[dof])
+    return data.replace(
+        qpos=data.qpos.at[qpos].set(pose),
+        qvel=data.qvel.at[dof].set(motion),
+        qacc_warmstart=data.qacc_warmstart.at[dof].set(warm),
+    )

@@ -1,0 +1,177 @@
+"""The only tie to MJX's private functions.
+
+MJX's own `forward` cannot be told which body a geom belongs to at run time, nor replace
+the inertia of a body by a full tensor; its stages can. They are private and may move
+between releases, so they are all called here, and `tests/test_rigid.py` watches them.
+Every function maps (model, data) to data, as MJX's do.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from mujoco import mjx
+from mujoco.mjx._src import (
+    collision_driver,
+    constraint,
+    forward,
+    sensor,
+    smooth,
+    support,
+)
+from mujoco.mjx._src import math as mjx_math
+
+Collider = Callable[..., tuple[jax.Array, jax.Array, jax.Array]]
+
+_UPPER = ((0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2))
+
+
+def numeric(model: mjx.Model, name: str) -> int:
+    """Return a whole number from the model's `<custom><numeric>`, -1 if absent."""
+    return collision_driver._numeric(model, name)
+
+
+def kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Place every body, and find the axes of motion about the centres of mass."""
+    data = smooth.kinematics(model, data)
+    data = smooth.com_pos(model, data)
+    if model.ncam:
+        data = smooth.camlight(model, data)
+    return smooth.tendon(model, data) if model.ntendon else data
+
+
+def set_inertia(
+    data: mjx.Data, body: np.ndarray, mass: jax.Array, inertia: jax.Array
+) -> mjx.Data:
+    """Give bodies (K,) their mass (K,) and inertia (K, 3, 3), in the axes of each body.
+
+    The whole tensor goes in, without principal axes: an eigenvector of a cube's inertia
+    has no derivative.
+    """
+    turn = data.xmat[body]
+    spatial_inertia = turn @ inertia @ jnp.swapaxes(turn, 1, 2)
+    entries = jnp.concatenate(
+        [
+            spatial_inertia[:, _UPPER[0], _UPPER[1]],
+            jnp.zeros_like(mass)[:, None].repeat(3, 1),
+            mass[:, None],
+        ],
+        axis=1,
+    )
+    cinert = data._impl.cinert.at[body].set(entries)
+    return data.tree_replace({"_impl.cinert": cinert})
+
+
+def factor_inertia(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Compute the joint-space inertia matrix and its factor."""
+    data = smooth.crb(model, data)
+    data = smooth.tendon_armature(model, data) if model.ntendon else data
+    return smooth.factor_m(model, data)
+
+
+def geom_pairs(model: mujoco.MjModel) -> np.ndarray:
+    """Return the pairs of geoms that may collide, (pairs, 2), as contacts have them."""
+    pairs = [(a, b) for a, b, _ in collision_driver.geom_pairs(model)]
+    return np.array(pairs, dtype=int).reshape(-1, 2)
+
+
+def contact_groups(model: mjx.Model, data: mjx.Data) -> list[tuple[Any, Any, Collider]]:
+    """Return (key, contacts, collider) for each kind of geom pair in the model.
+
+    The contacts have their parameters and their two geoms, one row a pair; distance,
+    position and frame are for the collider to find.
+    """
+    groups = collision_driver._contact_groups(model, data)
+    return [
+        (key, contacts, collision_driver._COLLISION_FUNC[key.types])
+        for key, contacts in groups.items()
+    ]
+
+
+def contact_frame(normal: jax.Array) -> jax.Array:
+    """Return the contact frame (3, 3) of a normal (3,), rows normal, tangents."""
+    return mjx_math.make_frame(normal)
+
+
+def constraint_rows(model: mjx.Model, data: mjx.Data, geom_body: jax.Array) -> mjx.Data:
+    """Write the constraint rows, with the geoms on the given bodies (G,)."""
+    # `geom_bodyid` is metadata of the model: a traced copy must not cross a jit, vmap
+    # or scan boundary, so it exists for this one call.
+    return constraint.make_constraint(model.replace(geom_bodyid=geom_body), data)
+
+
+def smooth_acceleration(
+    model: mjx.Model, data: mjx.Data, frozen: jax.Array
+) -> mjx.Data:
+    """Compute the acceleration without constraints; frozen dofs (V,) feel no bias."""
+    data = smooth.transmission(model, data)
+    data = forward.fwd_velocity(model, data)
+    data = sensor.sensor_vel(model, data) if model.nsensor else data
+    data = forward.fwd_actuation(model, data)
+    data = data.replace(qfrc_bias=jnp.where(frozen, 0.0, data.qfrc_bias))
+    return forward.fwd_acceleration(model, data)
+
+
+def without_matrices(data: mjx.Data) -> mjx.Data:
+    """Drop the matrices that every step computes anew: most of a world's bytes."""
+    impl = data._impl
+    return data.tree_replace(
+        {
+            "_impl.efc_J": jnp.zeros((0, data.qvel.shape[0]), impl.efc_J.dtype),
+            "_impl.M": jnp.zeros((0,) * impl.M.ndim, impl.M.dtype),
+            "_impl.qLD": jnp.zeros((0,) * impl.qLD.ndim, impl.qLD.dtype),
+        }
+    )
+
+
+def position_sensors(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Read the sensors of position, where there are any."""
+    return sensor.sensor_pos(model, data) if model.nsensor else data
+
+
+def mass_matrix(model: mjx.Model, data: mjx.Data) -> jax.Array:
+    """Return the joint-space inertia matrix, (V, V)."""
+    return support.full_m(model, data)
+
+
+def row_bounds(data: mjx.Data) -> tuple[jax.Array, jax.Array]:
+    """Return the least and the greatest force of each constraint row, both (R,).
+
+    Equality rows pull and push, dry friction is bounded, the others only push; a force
+    is counted as minus the derivative of the cost, so pushing is the lower side.
+    """
+    impl = data._impl
+    count = impl.efc_J.shape[0]
+    friction = impl.efc_frictionloss
+    row = np.arange(count)
+    equality, dry = row < impl.ne, (row >= impl.ne) & (row < impl.ne + impl.nf)
+    endless = jnp.full_like(friction, jnp.inf)
+    lower = jnp.where(dry, -friction, -endless)
+    upper = jnp.where(equality, endless, jnp.where(dry, friction, 0.0))
+    return lower, upper
+
+
+def normal_force(data: mjx.Data) -> jax.Array:
+    """Return the normal force of each contact from its rows' forces, (contacts,) N."""
+    impl = data._impl
+    start = impl.ne + impl.nf + impl.nl
+    parts = []
+    for condim in (1, 3, 4, 6):
+        count = int(np.sum(impl.contact.dim == condim))
+        # The edges of a friction pyramid add up to the normal force.
+        rows = 1 if condim == 1 else 2 * (condim - 1)
+        block = impl.efc_force[start : start + count * rows]
+        parts.append(block.reshape(count, rows).sum(axis=1))
+        start += count * rows
+    return jnp.concatenate(parts)
+
+
+def integrate(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Advance one time step by the model's integrator."""
+    data = sensor.sensor_acc(model, data) if model.nsensor else data
+    if model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER:
+        return forward.euler(model, data)
+    return forward.implicit(model, data)

@@ -1,0 +1,344 @@
+"""Worlds: physics and fracture together, one step at a time.
+
+A World is everything that changes: MJX's data, the fracture state, and who rides in
+which slot. `step` moves it by one time step; it can be jitted, vmapped over worlds,
+scanned and differentiated. What a call leaves out (no impact, no damage, no sensors, no
+pairs of chunks) is not in the program.
+"""
+
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from mujoco import mjx
+
+from blastjax import chunks, fracture, graph, pytree, spatial
+from blastjax.core import NONE, Damage, FractureEvents, SplitEvents, State
+from blastjax.damage import falloff
+from blastjax.rigid import bodies, contact, engine, solver
+from blastjax.rigid.scene import Scene
+
+GRACE_STEPS = 1
+"""Steps for which the pieces of one split do not collide, unless told otherwise."""
+
+
+@pytree.dataclass
+class Debris(pytree.Node):
+    """What left the simulation, in all."""
+
+    count: jax.Array
+    """() int32 actors."""
+    volume: jax.Array
+    """() m^3."""
+    mass: jax.Array
+    """() kg."""
+
+
+@pytree.dataclass
+class World(pytree.Node):
+    """Everything in a scene that changes."""
+
+    data: mjx.Data
+    """MJX's data: positions, velocities, controls; poses as the step found them. No
+    constraint Jacobian and inertia matrix: each step makes them anew."""
+    state: State
+    """Healths and actors."""
+    bodies: bodies.Bodies
+    """The slots of the moving actors, and what they carry."""
+    debris: Debris
+    """What was removed so far."""
+    dropped: contact.Dropped
+    """What the caps left out so far: raise `max_pairs`, `max_contacts` if not 0."""
+
+
+@pytree.dataclass
+class Impact(pytree.Node):
+    """How contacts hurt.
+
+    A contact with normal force F takes max(F - threshold, 0) dt / hardness of health
+    from the actors that it touches: damage follows the impulse, whatever the time step
+    and whether the striker was light and fast or heavy and slow, and a load below the
+    threshold may rest forever.
+    """
+
+    threshold: jax.Array | float = 0.0
+    """() normal force that does no harm, N."""
+    hardness: jax.Array | float = 1.0
+    """() impulse that takes one unit of health, N s."""
+    min_radius: jax.Array | float = 0.0
+    """() distance from the contact up to which bonds take all of it, m."""
+    max_radius: jax.Array | float = 1.0
+    """() distance from which they take none of it, m."""
+
+
+@pytree.dataclass
+class Events(pytree.Node):
+    """What happened in a step."""
+
+    impulse: jax.Array
+    """(A,) normal impulse on each element's chunk, N s."""
+    solver: solver.Report
+    """How the contact solver did."""
+    dropped: contact.Dropped
+    """What the caps left out in this step."""
+    damage: Damage | None
+    """All damage that was dealt, or None if the call left it out."""
+    fracture: FractureEvents | None
+    """What broke, or None likewise."""
+    split: SplitEvents | None
+    """What came apart, or None likewise."""
+    removed: jax.Array | None
+    """(A,) bool by label, actors that became debris, or None likewise."""
+
+
+def init(
+    scene: Scene,
+    state: State | None = None,
+    *,
+    bond_health: Any = 1.0,
+    chunk_health: Any = 1.0,
+    velocity: Any = (0.0, 0.0, 0.0),
+    spin: Any = (0.0, 0.0, 0.0),
+    remove_dead: bool = False,
+) -> World:
+    """Return a world at its start.
+
+    Args:
+      scene: the scene.
+      state: the asset's state; by default unbroken, with the healths given.
+      bond_health: one for all bonds or (B,); unused with a state.
+      chunk_health: one for all chunks or (A,); unused with a state.
+      velocity: (3,) of the rest frame's origin, m/s; the world's part stays still.
+      spin: (3,) angular velocity in world axes, rad/s.
+      remove_dead: see `step`.
+    """
+    if state is None:
+        state = fracture.init(scene.asset, bond_health, chunk_health)
+    data = engine.without_matrices(mjx.make_data(scene.model, impl="jax"))
+    return _begin(scene, data, state, velocity, spin, remove_dead)
+
+
+@functools.partial(jax.jit, static_argnums=5)
+def _begin(
+    scene: Scene,
+    data: mjx.Data,
+    state: State,
+    velocity: Any,
+    spin: Any,
+    remove_dead: bool,
+) -> World:
+    asset, dtype = scene.asset, scene.position.dtype
+    zero = jnp.zeros((), jnp.int32)
+    nothing = jnp.zeros((), dtype)
+    start = bodies.nobody(scene)
+    everything = jnp.full_like(start.slot, scene.slots)
+    here = chunks.active(asset, state)
+    labels = jnp.arange(here.shape[0], dtype=jnp.int32)
+    # As if the world had held all of it and let go now.
+    world = World(
+        data=data,
+        state=state,
+        bodies=start.replace(slot=everything),
+        debris=Debris(count=zero, volume=nothing, mass=nothing),
+        dropped=contact.Dropped(pairs=zero, contacts=zero),
+    )
+    released = SplitEvents(
+        parent=jnp.where(here, labels, -1), created=here, released=jnp.zeros_like(here)
+    )
+    world, _ = _regroup(scene, world, state, released, remove_dead, 0)
+    return _push(scene, world, velocity, spin)
+
+
+def step(
+    scene: Scene,
+    world: World,
+    *,
+    ctrl: jax.Array | None = None,
+    damage: Damage | None = None,
+    impact: Impact | None = None,
+    remove_dead: bool = False,
+    grace_steps: int | jax.Array = GRACE_STEPS,
+) -> tuple[World, Events]:
+    """Advance by one time step, then break what was hit.
+
+    Args:
+      scene: the scene.
+      world: the world.
+      ctrl: (nu,) controls of the user's actuators; by default those in the data.
+      damage: health to take away in this step, besides that by impact.
+      impact: how contacts hurt; None if they do not.
+      remove_dead: whether single chunks without health and without children leave the
+        simulation as debris. In Blast they stay.
+      grace_steps: steps for which the pieces of one split do not collide. What they
+        overlap when it ends is forgiven: see `rigid.contact`.
+
+    Returns:
+      The world and what happened. With neither damage nor impact nothing can break, and
+      nothing of fracture is in the program.
+    """
+    riding, data = world.bodies, world.data
+    data = data if ctrl is None else data.replace(ctrl=ctrl)
+    model = bodies.weigh(scene, riding)
+    frames = bodies.frames(scene, riding, data)
+
+    data = bodies.place(scene, riding, data)
+    data = bodies.kinematics(scene, model, riding, data)
+    data, found = contact.collide(scene, riding, model, data)
+    data = engine.constraint_rows(model, data, found.riders.body)
+    data = engine.position_sensors(model, data)
+    data = engine.smooth_acceleration(model, data, bodies.empty_dofs(scene, riding))
+    data, report = contact.resolve(model, data, scene.line_search)
+    data = engine.integrate(model, data)
+    force = contact.normal_force(data)
+
+    world = world.replace(
+        data=engine.without_matrices(data),
+        bodies=bodies.settle(riding.replace(overlap=found.overlap)),
+        dropped=jax.tree.map(jnp.add, world.dropped, found.dropped),
+    )
+    events = Events(
+        impulse=contact.element_force(scene, data, force) * model.opt.timestep,
+        solver=report,
+        dropped=found.dropped,
+        damage=None,
+        fracture=None,
+        split=None,
+        removed=None,
+    )
+    if damage is None and impact is None:
+        return world, events
+
+    if impact is not None:
+        struck = impact_damage(scene, world, frames, found.riders, force, impact)
+        damage = struck if damage is None else _add(damage, struck)
+    assert damage is not None
+    state, broken = fracture.apply(scene.asset, world.state, damage)
+    state, parted = fracture.split(scene.asset, state)
+    world, removed = _regroup(scene, world, state, parted, remove_dead, grace_steps)
+    events = events.replace(
+        damage=damage, fracture=broken, split=parted, removed=removed
+    )
+    return world, events
+
+
+def impact_damage(
+    scene: Scene,
+    world: World,
+    frames: bodies.Frames,
+    carried: contact.Riders,
+    force: jax.Array,
+    impact: Impact,
+) -> Damage:
+    """Return what the step's contacts do to bonds and chunks.
+
+    Args:
+      scene: the scene.
+      world: with the step's contacts in its data, and actors as they were then.
+      frames: of the slots when the contacts were found.
+      carried: what carried each geom then.
+      force: (contacts,) normal forces, N.
+      impact: how contacts hurt.
+
+    Returns:
+      Damage: for each bond, and each chunk that is an actor by itself, the sum over all
+      contacts on its actor, each weighted by the falloff of the distance in the rest
+      frame. Every contact counts, there is no cap.
+    """
+    asset, state, touch = scene.asset, world.state, world.data._impl.contact
+    excess = jnp.maximum(force - impact.threshold, 0.0)
+    amount = excess * scene.model.opt.timestep / impact.hardness
+    bond_owner = state.actor[asset.bond_nodes[:, 0]]
+    element = jnp.asarray(scene.host.geom_element, jnp.int32)
+    total = Damage(
+        bond=jnp.zeros_like(state.bond_health), chunk=jnp.zeros_like(state.chunk_health)
+    )
+
+    def one(point: jax.Array, amount: jax.Array, label: jax.Array) -> Damage:
+        dealt = falloff(
+            asset, state, point, amount, impact.min_radius, impact.max_radius
+        )
+        own = bond_owner == label, state.actor == label
+        return jax.tree.map(
+            lambda mine, health: jnp.where(mine, health, 0), Damage(*own), dealt
+        )
+
+    for side in scene.host.chunk_sides:
+        geom = touch.geom[:, side]
+        slot = carried.slot[geom]
+        hit = jnp.where(slot == NONE, 0.0, amount)
+        point = bodies.to_rest(frames, jnp.maximum(slot, 0), touch.pos)
+        owner = state.actor[jnp.maximum(element[geom], 0)]
+        dealt = jax.vmap(one)(point, hit, owner)
+        total = jax.tree.map(lambda sum_, each: sum_ + each.sum(0), total, dealt)
+    return total
+
+
+def _regroup(
+    scene: Scene,
+    world: World,
+    state: State,
+    parted: SplitEvents,
+    remove_dead: bool,
+    grace_steps: int | jax.Array,
+) -> tuple[World, jax.Array]:
+    """Remove debris and give the actors of a new state their slots."""
+    before, gone = state, jnp.zeros(state.actor.shape[0], bool)
+    if remove_dead:
+        gone = _dead(scene, state)
+        state = fracture.deactivate(scene.asset, state, gone)
+    light = bodies.outcasts(scene, state)
+    state = fracture.deactivate(scene.asset, state, light)
+    gone = gone | light
+    debris = _swept(scene, world.debris, before, gone)
+    riding, data = bodies.reassign(
+        scene, world.bodies, world.data, state, parted, grace_steps
+    )
+    world = world.replace(state=state, bodies=riding, data=data, debris=debris)
+    return world, gone
+
+
+def _dead(scene: Scene, state: State) -> jax.Array:
+    """Return single chunks with no health and no children, (A,) bool by label."""
+    asset = scene.asset
+    leaf = chunks.alone(asset, state) & ~chunks.has_children(asset)
+    held = chunks.held(asset, state)[jnp.maximum(state.actor, 0)]
+    dead = leaf & ~held & (state.chunk_health <= 0)
+    return graph.group_any(dead, state.actor, state.actor.shape[0])
+
+
+def _swept(scene: Scene, debris: Debris, state: State, gone: jax.Array) -> Debris:
+    """Add the actors that go, as they were in the state before, to the debris."""
+    asset = scene.asset
+    out = (state.actor != NONE) & gone[jnp.maximum(state.actor, 0)]
+    volume = chunks.element_values(asset, asset.chunk_volume)
+    mass = chunks.element_values(asset, asset.chunk_volume * scene.density)
+    return Debris(
+        count=debris.count + jnp.sum(gone, dtype=jnp.int32),
+        volume=debris.volume + jnp.sum(jnp.where(out, volume, 0.0)),
+        mass=debris.mass + jnp.sum(jnp.where(out, mass, 0.0)),
+    )
+
+
+def _push(scene: Scene, world: World, velocity: Any, spin: Any) -> World:
+    """Give every actor the velocity field of one rigid motion."""
+    dtype, host = scene.position.dtype, scene.host
+    linear, angular = jnp.asarray(velocity, dtype), jnp.asarray(spin, dtype)
+    used = (world.bodies.label != NONE)[:, None]
+    pose = world.data.qpos[host.slot_qpos]
+    arm = pose[:, :3] - scene.position[None]
+    about = jnp.broadcast_to(angular, arm.shape)
+    moving = linear[None] + jnp.cross(about, arm)
+    turning = spatial.rotate(about, spatial.conjugate(pose[:, 3:]))
+    motion = jnp.where(used, jnp.concatenate([moving, turning], axis=1), 0.0)
+    qvel = world.data.qvel.at[host.slot_dof].set(motion)
+    return world.replace(data=world.data.replace(qvel=qvel))
+
+
+def _add(first: Damage, second: Damage) -> Damage:
+    def total(a: jax.Array | None, b: jax.Array | None) -> jax.Array | None:
+        return b if a is None else a if b is None else a + b
+
+    return Damage(
+        bond=total(first.bond, second.bond), chunk=total(first.chunk, second.chunk)
+    )
