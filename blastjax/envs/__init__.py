@@ -1,0 +1,10 @@
+"""Brax-style environments: `reset(key) -> State`, `step(state, action) -> State`.
+
+Everything that an episode changes lives in `State.pipeline_state`, so that Brax's
+auto-reset rebuilds it. Each environment has its `scene`, and a method `world` that
+finds the World in a pipeline state, for rendering.
+"""
+
+from blastjax.envs.breach import Breach, Config
+
+__all__ = ["Breach", "Config"]
