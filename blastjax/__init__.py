@@ -7,7 +7,7 @@ Importing this loads jax and numpy only. The rooms that need MuJoCo, Brax or gym
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from blastjax import author, chunks, core, damage, fracture, graph, spatial
+from blastjax import author, chunks, core, damage, fracture, graph, spatial, stress
 from blastjax.core import Asset, Damage, State
 
 if TYPE_CHECKING:
@@ -29,6 +29,7 @@ __all__ = [
     "render",
     "rigid",
     "spatial",
+    "stress",
     "world",
     "wrappers",
 ]

@@ -25,7 +25,7 @@ import mujoco
 import numpy as np
 
 from blastjax import chunks, pytree
-from blastjax.core import NONE
+from blastjax.core import NONE, Asset, State
 from blastjax.rigid import bodies
 from blastjax.rigid.scene import Scene
 from blastjax.world import World
@@ -342,6 +342,116 @@ def _colors(scene: Scene, shown: Pose) -> dict[int, np.ndarray]:
     return colors
 
 
+def draw_utilisation(
+    asset: Asset,
+    state: State,
+    utilisation: jax.Array,
+    path: str | os.PathLike[str],
+    *,
+    width: int = 800,
+    height: int = 600,
+    azimuth: float = 55.0,
+    elevation: float = -22.0,
+    zoom: float = 1.0,
+) -> pathlib.Path:
+    """Draw the support chunks of an asset at rest, coloured by what their bonds bear.
+
+    A chunk has the colour of its worst bond that still connects, one past its limit a
+    colour of its own, and one without bonds is grey.
+
+    Args:
+      asset: the asset.
+      state: its state.
+      utilisation: (B,) part of the limit that each bond uses, of `stress.judge`.
+      path: of a .png.
+      width: of the picture, pixels.
+      height: of the picture, pixels.
+      azimuth: where the camera looks, degrees from x towards y.
+      elevation: how far above the horizon it looks, degrees; negative is down.
+      zoom: how large the whole asset appears.
+
+    Raises:
+      ValueError: the path is no .png, cannot be written, or a shape is wrong.
+      ImportError: matplotlib is missing.
+    """
+    target = check_path(path)
+    if target.suffix.lower() != ".png":
+        raise ValueError(f"{os.fspath(path)!r} is one picture; use .png")
+    host: Any = jax.device_get(asset)
+    used = np.asarray(utilisation)
+    if used.shape != host.bond_area.shape:
+        raise ValueError(
+            f"utilisation has shape {used.shape}; give {host.bond_area.shape}"
+        )
+    node = np.flatnonzero(host.element_chunk[: len(host.span_node)] >= 0)
+    chunk = host.element_chunk[node]
+    worst = _worst_of_nodes(host, jax.device_get(state), used)[node]
+    colors = _need("matplotlib", "matplotlib").colormaps["YlOrRd"]
+    colors = colors.with_extremes(over=_PAST_LIMIT)
+    paints = np.where(worst[:, None] >= 0, colors(worst), _IDLE)
+
+    place, size = host.chunk_centroid[chunk], host.chunk_size[chunk]
+    low, high = (place - size).min(axis=0), (place + size).max(axis=0)
+    reach = np.linalg.norm(high - low) / zoom
+    axes = _axes(azimuth, elevation)
+    eye = (low + high) / 2 - 1.4 * reach * axes[2]
+    solids = [
+        [face * _JOINT + x for face in _outward(_box(s))]
+        for x, s in zip(place, size, strict=True)
+    ]
+    drawn = []
+    for i in _back_to_front(solids, eye):
+        drawn += _lit(solids[i], paints[i], (eye, axes, 2.4))
+    return _with_bar(target, drawn, colors, width, height)
+
+
+_PAST_LIMIT = (0.25, 0.0, 0.35, 1.0)
+_IDLE = np.array([0.72, 0.74, 0.76, 1.0])
+
+
+def _worst_of_nodes(host: Any, state: Any, utilisation: np.ndarray) -> np.ndarray:
+    """Return the largest utilisation of each node's bonds, (N,), -1 without any."""
+    worst = np.full(len(host.span_node), -1.0)
+    alive = np.asarray(state.bond_intact)
+    for side in (0, 1):
+        np.maximum.at(worst, host.bond_nodes[alive, side], utilisation[alive])
+    return worst
+
+
+def _with_bar(
+    path: pathlib.Path,
+    drawn: list[tuple[np.ndarray, np.ndarray]],
+    colors: Any,
+    width: int,
+    height: int,
+) -> pathlib.Path:
+    """Write polygons and a colour bar from 0 to 1."""
+    polygons = _need("matplotlib.collections", "matplotlib").PolyCollection
+    mappable = _need("matplotlib.cm", "matplotlib").ScalarMappable
+    norm = _need("matplotlib.colors", "matplotlib").Normalize(0, 1)
+    figure = _need("matplotlib.figure", "matplotlib").Figure(
+        figsize=(width / 100, height / 100), dpi=100
+    )
+    share = 0.85
+    plot = figure.add_axes((0, 0, share, 1))
+    plot.set_axis_off()
+    wide = share * width / height
+    plot.set_xlim(-wide, wide)
+    plot.set_ylim(-1, 1)
+    shapes, paints = zip(*drawn, strict=True) if drawn else ((), ())
+    plot.add_collection(
+        polygons(shapes, facecolors=paints, edgecolors="face", linewidths=0.3)
+    )
+    figure.colorbar(
+        mappable(norm, colors),
+        cax=figure.add_axes((share + 0.02, 0.15, 0.03, 0.7)),
+        extend="max",
+        label="utilisation of the elastic limit",
+    )
+    figure.savefig(path)
+    return path
+
+
 class _OpenGL:
     """Paints with MuJoCo.
 
@@ -522,14 +632,19 @@ def _brightness(normal: np.ndarray) -> float:
 
 def _view(model: mujoco.MjModel, camera: mujoco.MjvCamera) -> View:
     """Return the eye (3,), right, up and forward (3, 3), and 1 / tan(fovy / 2)."""
-    turn, rise = np.radians(camera.azimuth), np.radians(camera.elevation)
+    axes = _axes(camera.azimuth, camera.elevation)
+    eye = np.array(camera.lookat) - camera.distance * axes[2]
+    return eye, axes, 1.0 / np.tan(np.radians(model.vis.global_.fovy) / 2)
+
+
+def _axes(azimuth: float, elevation: float) -> np.ndarray:
+    """Return right, up and forward of a camera, (3, 3)."""
+    turn, rise = np.radians(azimuth), np.radians(elevation)
     forward = np.array(
         [np.cos(rise) * np.cos(turn), np.cos(rise) * np.sin(turn), np.sin(rise)]
     )
     right = np.array([np.sin(turn), -np.cos(turn), 0.0])
-    axes = np.stack([right, np.cross(right, forward), forward])
-    eye = np.array(camera.lookat) - camera.distance * forward
-    return eye, axes, 1.0 / np.tan(np.radians(model.vis.global_.fovy) / 2)
+    return np.stack([right, np.cross(right, forward), forward])
 
 
 def _project(corners: np.ndarray, view: View) -> np.ndarray:
@@ -578,7 +693,11 @@ def _faces(model: mujoco.MjModel, geom: int) -> list[np.ndarray]:
         faces = _prism(size[0], size[1])
     else:
         faces = []
-    # All of these are convex about their middle: outward is away from it.
+    return _outward(faces)
+
+
+def _outward(faces: list[np.ndarray]) -> list[np.ndarray]:
+    """Turn the faces of a solid that is convex about its middle away from it."""
     return [f if _normal(f) @ f.mean(axis=0) > 0 else f[::-1] for f in faces]
 
 

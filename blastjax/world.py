@@ -11,6 +11,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from mujoco import mjx
 
 from blastjax import chunks, fracture, graph, pytree, spatial
@@ -18,6 +19,10 @@ from blastjax.core import NONE, Damage, FractureEvents, SplitEvents, State
 from blastjax.damage import falloff
 from blastjax.rigid import bodies, contact, engine, solver
 from blastjax.rigid.scene import Scene
+from blastjax.stress.equilibrium import Structure
+from blastjax.stress.failure import Verdict, judge, stress_damage
+from blastjax.stress.limits import Limits
+from blastjax.stress.loads import Load, add, gravity, node_place
 
 GRACE_STEPS = 1
 """Steps for which the pieces of one split do not collide, unless told otherwise."""
@@ -73,6 +78,32 @@ class Impact(pytree.Node):
 
 
 @pytree.dataclass
+class Stress(pytree.Node):
+    """How loads hurt.
+
+    In each step the bonds balance gravity and the step's contacts as if at rest, or as
+    rigid pieces where the world does not hold them, and what they bear takes health by
+    `stress.damage`: all of it beyond a fatal limit. Between an elastic and a fatal
+    limit it is a part of the health every step, the faster the shorter the time step.
+    """
+
+    structure: Structure
+    """Of the scene's asset, at the scene's density."""
+    limits: Limits
+    """Of one material, or of M."""
+    material: jax.Array | None = None
+    """(B,) int32 material of each bond; None if there is one only."""
+    area: jax.Array | None = None
+    """(B,) that bears the load, m^2; None for the bonded areas."""
+    gravity: bool = pytree.static(default=True)
+    """Whether what the world holds bears its own weight. Other pieces fall freely."""
+    contacts: bool = pytree.static(default=True)
+    """Whether contacts load the chunks that they touch."""
+    iterations: int = pytree.static(default=200)
+    """Most steps of the two-level method."""
+
+
+@pytree.dataclass
 class Events(pytree.Node):
     """What happened in a step."""
 
@@ -90,6 +121,8 @@ class Events(pytree.Node):
     """What came apart, or None likewise."""
     removed: jax.Array | None
     """(A,) bool by label, actors that became debris, or None likewise."""
+    verdict: Verdict | None = None
+    """What the bonds bore and whether its solution converged; None without stress."""
 
 
 def init(
@@ -157,6 +190,7 @@ def step(
     ctrl: jax.Array | None = None,
     damage: Damage | None = None,
     impact: Impact | None = None,
+    stress: Stress | None = None,
     remove_dead: bool = False,
     grace_steps: int | jax.Array = GRACE_STEPS,
 ) -> tuple[World, Events]:
@@ -168,14 +202,15 @@ def step(
       ctrl: (nu,) controls of the user's actuators; by default those in the data.
       damage: health to take away in this step, besides that by impact.
       impact: how contacts hurt; None if they do not.
+      stress: how loads hurt; None if they do not.
       remove_dead: whether single chunks without health and without children leave the
         simulation as debris. In Blast they stay.
       grace_steps: steps for which the pieces of one split do not collide. What they
         overlap when it ends is forgiven: see `rigid.contact`.
 
     Returns:
-      The world and what happened. With neither damage nor impact nothing can break, and
-      nothing of fracture is in the program.
+      The world and what happened. Without damage, impact and stress nothing can break,
+      and nothing of fracture is in the program.
     """
     riding, data = world.bodies, world.data
     data = data if ctrl is None else data.replace(ctrl=ctrl)
@@ -206,12 +241,17 @@ def step(
         split=None,
         removed=None,
     )
-    if damage is None and impact is None:
+    if damage is None and impact is None and stress is None:
         return world, events
 
     if impact is not None:
         struck = impact_damage(scene, world, frames, found.riders, force, impact)
         damage = struck if damage is None else _add(damage, struck)
+    if stress is not None:
+        verdict = bear(scene, world, frames, found.riders, stress)
+        strained = _strain(world.state, verdict, stress)
+        damage = strained if damage is None else _add(damage, strained)
+        events = events.replace(verdict=verdict)
     assert damage is not None
     state, broken = fracture.apply(scene.asset, world.state, damage)
     state, parted = fracture.split(scene.asset, state)
@@ -272,6 +312,104 @@ def impact_damage(
         dealt = jax.vmap(one)(point, hit, owner)
         total = jax.tree.map(lambda sum_, each: sum_ + each.sum(0), total, dealt)
     return total
+
+
+def bear(
+    scene: Scene,
+    world: World,
+    frames: bodies.Frames,
+    carried: contact.Riders,
+    stress: Stress,
+) -> Verdict:
+    """Return how the bonds bear the step's loads.
+
+    Args:
+      scene: the scene.
+      world: with the step's contacts in its data, and actors as they were then.
+      frames: of the slots when the contacts were found.
+      carried: what carried each geom then.
+      stress: how loads hurt.
+    """
+    asset, none = scene.asset, jnp.zeros_like(node_place(scene.asset))
+    load = Load(force=none, torque=none)
+    if stress.gravity and asset.has_world:
+        load = add(load, held_weight(scene, world.state, stress.structure.mass))
+    if stress.contacts and scene.host.chunk_sides:
+        load = add(load, contact_load(scene, world.data, frames, carried))
+    return judge(
+        stress.structure,
+        asset,
+        world.state,
+        load,
+        stress.limits,
+        material=stress.material,
+        area=stress.area,
+        iterations=stress.iterations,
+    )
+
+
+def held_weight(scene: Scene, state: State, mass: jax.Array) -> Load:
+    """Return the weight (N,) of what the world holds, in the rest frame."""
+    held = state.actor[: mass.shape[0]] == 0
+    back = spatial.conjugate(scene.quaternion)
+    down = spatial.rotate(scene.model.opt.gravity.astype(mass.dtype), back)
+    return gravity(jnp.where(held, mass, 0), down)
+
+
+def contact_load(
+    scene: Scene, data: mjx.Data, frames: bodies.Frames, carried: contact.Riders
+) -> Load:
+    """Return the contact forces on the nodes, each in its actor's rest frame.
+
+    Chunks below the support level have no bonds, and no load.
+    """
+    place = node_place(scene.asset)
+    num_nodes, touch = place.shape[0], data._impl.contact
+    element = jnp.asarray(scene.host.geom_element, jnp.int32)
+    total = Load(force=jnp.zeros_like(place), torque=jnp.zeros_like(place))
+    push = contact_force(data)
+    for side in scene.host.chunk_sides:
+        geom = touch.geom[:, side]
+        slot = jnp.maximum(carried.slot[geom], 0)
+        node = jnp.where(carried.slot[geom] == NONE, NONE, element[geom])
+        back = spatial.conjugate(frames.quaternion[slot])
+        force = spatial.rotate(push if side else -push, back)
+        point = bodies.to_rest(frames, slot, touch.pos)
+        arm = point - place[jnp.clip(node, 0, num_nodes - 1)]
+        part = Load(
+            force=graph.group_sum(force, node, num_nodes),
+            torque=graph.group_sum(jnp.cross(arm, force), node, num_nodes),
+        )
+        total = add(total, part)
+    return total
+
+
+def contact_force(data: mjx.Data) -> jax.Array:
+    """Return the force of each contact on its second geom, (contacts, 3) N, world axes.
+
+    Friction of rolling and twisting is left out.
+    """
+    impl = data._impl
+    touch, start = impl.contact, impl.ne + impl.nf + impl.nl
+    parts = []
+    for size in (1, 3, 4, 6):
+        count = int(np.sum(touch.dim == size))
+        rows = 1 if size == 1 else 2 * (size - 1)
+        block = impl.efc_force[start : start + count * rows].reshape(count, rows)
+        start += count * rows
+        local = jnp.zeros((count, 3), block.dtype).at[:, 0].set(block.sum(axis=1))
+        if size > 1:
+            # Opposite edges of the pyramid: their difference is the friction.
+            edges = block[:, :4].reshape(count, 2, 2)
+            local = local.at[:, 1:].set(edges[..., 0] - edges[..., 1])
+        parts.append(local)
+    local = jnp.concatenate(parts)
+    local = local.at[:, 1:].multiply(touch.friction[:, :2])
+    return jnp.einsum("ni,nij->nj", local, touch.frame)
+
+
+def _strain(state: State, verdict: Verdict, stress: Stress) -> Damage:
+    return stress_damage(state, verdict, stress.limits, material=stress.material)
 
 
 def _regroup(

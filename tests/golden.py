@@ -1,10 +1,12 @@
-"""Replay recorded Blast data: `python -m tests.golden lowlevel|desc FILE.npz`.
+"""Replay recorded Blast data: `python -m tests.golden lowlevel|desc|stress FILE.npz`.
 
 Every case goes two ways: through the public library, compared at level 1 (partition,
 visible chunks, flags, healths, damage), and through the plain-Python reference,
-compared to the last bit and list order, so that no number of a file goes unread. The
-last line counts mismatches and, by name, where the library differs from Blast on
-purpose; the exit code is 0 only if there are no mismatches.
+compared to the last bit and list order, so that no number of a file goes unread. Stress
+solves go through the parity solver, compared within float32 noise, and through the
+rules around it. The last line counts mismatches and, by name, where the library differs
+from Blast on purpose or float32 does not decide; the exit code is 0 only if there are
+no mismatches.
 """
 
 import argparse
@@ -12,7 +14,15 @@ import collections
 import sys
 import time
 
-from tests import conformance, recorded, replay
+import numpy as np
+
+from tests import (
+    conformance,
+    conformance_stress,
+    recorded,
+    replay,
+    replay_stress,
+)
 
 
 def lowlevel(path):
@@ -32,7 +42,16 @@ def desc(path):
         )
 
 
-KINDS = {"lowlevel": lowlevel, "desc": desc}
+def stress(path):
+    """Yield the same of a recording of stress solves, and the errors by frame."""
+    for case in recorded.stress_cases(path):
+        found, differences, errors = conformance_stress.check_stress(case)
+        found = found + replay_stress.verify_stress(case)
+        yield case["case_id"], found, differences, errors
+
+
+KINDS = {"lowlevel": lowlevel, "desc": desc, "stress": stress}
+QUANTILES = 0.5, 0.9, 0.99, 1.0
 
 
 def run(kind, path, say=print):
@@ -40,9 +59,11 @@ def run(kind, path, say=print):
     start = time.perf_counter()
     cases = mismatches = 0
     total = collections.Counter()
+    errors = []
     try:
-        for number, found, differences in KINDS[kind](path):
+        for number, found, differences, *more in KINDS[kind](path):
             cases += 1
+            errors += more[0] if more else []
             mismatches += bool(found)
             total.update(differences)
             for line in found[:5]:
@@ -52,9 +73,25 @@ def run(kind, path, say=print):
         mismatches += 1
         say(f"after {cases} cases: {type(error).__name__}: {error}")
     counted = "".join(f", {n} {name}" for name, n in sorted(total.items()))
+    size = f"{cases} cases"
+    if kind == "stress":
+        size += f", {len(errors)} frames"
+        _say_quantiles(errors, say)
     seconds = time.perf_counter() - start
-    say(f"{kind}: {cases} cases, {mismatches} mismatches{counted}, {seconds:.0f} s")
+    say(f"{kind}: {size}, {mismatches} mismatches{counted}, {seconds:.0f} s")
     return mismatches
+
+
+def _say_quantiles(errors, say):
+    """Print how large the errors of the frames are, by their largest entries."""
+    for name, column in zip(
+        ("impulse", "stress"), zip(*errors, strict=True), strict=False
+    ):
+        row = np.quantile(column, QUANTILES)
+        text = ", ".join(
+            f"{q:.0%} {x:.1e}" for q, x in zip(QUANTILES, row, strict=True)
+        )
+        say(f"{name} errors of frames: {text}")
 
 
 def main(arguments=None):

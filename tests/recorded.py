@@ -60,6 +60,13 @@ BOND = "bond_normal bond_area bond_centroid bond_userdata init_bond_health"
 NODE = "node_chunk init_chunk_health"
 STATE = "state_bond_health state_chunk_health state_chunk_actor state_node_island"
 DESC = "desc_parent desc_flags desc_cov_flags desc_map_raw desc_map"
+SOLVER_NODE = "node_chunk node_mass node_volume node_pos"
+SOLVER_BOND = """bond_nodes bond_normal bond_area bond_centroid bond_userdata
+    bond_init_health"""
+FRAME_NODE = "frame_node_vel frame_node_island frame_solver_node"
+FRAME_BOND = """frame_bond_health frame_bond_in_solver frame_stress_normal
+    frame_stress_shear"""
+FRAME_SBOND = "frame_sbond_nodes frame_sbond_lin frame_sbond_ang"
 
 
 def lowlevel_cases(path):
@@ -150,3 +157,41 @@ def _desc_case(columns):
     case |= columns.ragged(DESC, case["desc_n_chunk"])
     case["material_hmmdo"] = columns.rows("material_hmmdo", 1)[0]
     return case
+
+
+def stress_cases(path):
+    """Yield the cases of a recording of the stress solver, a dict each.
+
+    Columns keep their names; `frames` is a list of dicts, one an update.
+    """
+    columns = Columns(path)
+    for _ in range(len(columns.data["case_id"])):
+        yield _stress_case(columns)
+    columns.finish("case_id")
+
+
+def _stress_case(columns):
+    case = columns.record("case_")
+    case |= columns.ragged(SOLVER_NODE, case["case_n_node"])
+    case |= columns.ragged(SOLVER_BOND, case["case_n_bond"])
+    case["frames"] = [
+        _frame(columns, case, number) for number in range(int(case["case_n_frame"]))
+    ]
+    return case
+
+
+def _frame(columns, case, number):
+    ragged = f"{FRAME_NODE} {FRAME_BOND} {FRAME_SBOND}"
+    frame = columns.record("frame_", ragged=ragged)
+    if frame["frame_case"] != case["case_id"] or frame["frame_index"] != number:
+        where = f"frame {frame['frame_index']} of case {frame['frame_case']}"
+        raise ValueError(f"{where} in place of {number} of case {case['case_id']}")
+    frame |= columns.ragged(FRAME_NODE, case["case_n_node"])
+    frame |= columns.ragged(FRAME_BOND, case["case_n_bond"])
+    frame |= columns.ragged(FRAME_SBOND, frame["frame_n_solver_bond"])
+    frame |= columns.ragged("load_type load_arg load_params", frame["frame_n_load"])
+    frame |= columns.ragged("cmd_actor cmd_nodes cmd_health", frame["frame_n_cmd"])
+    frame |= columns.ragged(
+        "excess_actor excess_force excess_torque", frame["frame_n_excess"]
+    )
+    return frame

@@ -32,3 +32,17 @@ def test_gymnasium_loop(capsys):
     total = load("gymnasium_loop").main(num_envs=3, steps=12, **SMALL)
     assert total.shape == (3,) and np.isfinite(total).all()
     assert "episodes ended" in capsys.readouterr().out
+
+
+def test_which_brick(capsys, tmp_path):
+    load("which_brick").main(tmp_path / "table.png")
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 2 + 26 + 1
+    assert lines[0] == "whole: safety factor 1.55" and lines[-1].endswith("can go")
+    assert (tmp_path / "table.png").stat().st_size > 5000
+
+
+def test_size_a_beam(capsys):
+    after = load("size_a_beam").main(length=4, steps=40)
+    np.testing.assert_allclose(after, 2.0, rtol=0.01)
+    assert "safety before" in capsys.readouterr().out
