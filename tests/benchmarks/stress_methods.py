@@ -258,15 +258,19 @@ def draw(rows, path):
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
+    from matplotlib.ticker import NullFormatter
 
     names = list(dict.fromkeys(row[0] for row in rows))
     across = -(-len(names) // 2)
     figure, panels = plt.subplots(2, across, figsize=(4 * across, 7), squeeze=False)
+    methods = {m: f"C{i}" for i, m in enumerate(dict.fromkeys(r[1] for r in rows))}
     for panel, name in zip(panels.flat, names, strict=False):
-        for method in dict.fromkeys(row[1] for row in rows):
+        for method, color in methods.items():
             line = [(r[4], r[3]) for r in rows if r[0] == name and r[1] == method]
             if line:
-                panel.loglog(*zip(*line, strict=True), "o-", ms=4, label=method)
+                x, y = zip(*line, strict=True)
+                panel.loglog(x, y, "o-", ms=4, label=method, color=color)
+        panel.xaxis.set_minor_formatter(NullFormatter())
         panel.set_title(name)
         panel.set_xlabel("run time, s")
         panel.set_ylabel("error of bond forces")
