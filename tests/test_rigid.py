@@ -165,10 +165,12 @@ def compare(monkeypatch, shape, cases, seconds, solve=contact.resolve):
     return from_mjx, from_c
 
 
-def test_unbroken_actor_is_a_rigid_body(x64, monkeypatch):
+@pytest.mark.parametrize("solve", [contact.resolve, solved_by_mjx])
+def test_unbroken_actor_is_a_rigid_body(x64, monkeypatch, solve):
     cases = [("falling", 0.005), ("sliding", 0.005)]
-    from_mjx, _ = compare(monkeypatch, (4, 1, 1), cases, 1.0, solved_by_mjx)
-    assert from_mjx < MJX_ERROR
+    from_mjx, from_c = compare(monkeypatch, (4, 1, 1), cases, 1.0, solve)
+    assert from_mjx < (MJX_ERROR if solve is solved_by_mjx else SOLVER_ERROR)
+    assert from_c < C_ERROR
 
 
 @pytest.mark.slow
