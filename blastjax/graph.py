@@ -1,4 +1,4 @@
-"""Kernels on plain arrays: islands of a graph, sums over groups.
+"""Kernels on plain arrays: islands of a graph, best ways, sums over groups.
 
 Node numbers are int32. A group number outside the range, such as a negative one, is
 dropped: padding needs no special case.
@@ -77,6 +77,91 @@ def shortest_ways(
         return new, jnp.any(new < way)
 
     return jax.lax.while_loop(lambda c: c[1], relax, (start, jnp.array(True)))[0]
+
+
+def bottleneck(
+    edges: jax.Array, weight: jax.Array, source: jax.Array, num_nodes: int
+) -> tuple[jax.Array, jax.Array]:
+    """Find the way to a source whose weakest edge is as strong as possible.
+
+    Args:
+      edges: (B, 2) nodes.
+      weight: (B,) strength, any sign; minus infinity or NaN for edges that lead nowhere.
+      source: (N,) bool, the nodes to reach.
+      num_nodes: N.
+
+    Returns:
+      (N,) weight of the weakest edge on the best way: infinite at the sources, minus
+      infinity where no way leads; and (N,) int32, which edge it is, -1 where the weight
+      is infinite. A node reaches a source over edges above t if and only if its weight
+      is above t. The derivative is one for the weakest edge and zero for all others,
+      exact wherever no two weights tie; of equal edges one is chosen.
+
+    Boruvka's rounds: every tree without a source hooks onto the tree behind the
+    strongest edge that leaves it. No edge inside a tree is weaker than the one by which
+    it hooks, so the minimum along the hooks is the answer, found by pointer doubling.
+    """
+    num_edges = edges.shape[0]
+    lowest = jnp.array(-jnp.inf, weight.dtype)
+    nodes = jnp.arange(num_nodes, dtype=jnp.int32)
+    if num_edges == 0:
+        return jnp.where(source, jnp.inf, lowest), jnp.full_like(nodes, -1)
+    first, second = edges[:, 0], edges[:, 1]
+    index = jnp.arange(num_edges, dtype=jnp.int32)
+    # Loops run on constants: nothing in here is differentiated.
+    strength = jax.lax.stop_gradient(weight)
+    strength = jnp.where(strength > lowest, strength, lowest)
+
+    def hook(
+        carry: tuple[jax.Array, jax.Array, jax.Array, jax.Array],
+    ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+        root, up, edge, _ = carry
+        a, b = root[first], root[second]
+        out = jnp.where(a != b, strength, lowest)
+        best = jnp.full(num_nodes, lowest).at[a].max(out).at[b].max(out)
+        # Of equal edges the first: without one order for all, hooks could form rings.
+        at_a = jnp.where((out > lowest) & (out == best[a]), index, num_edges)
+        at_b = jnp.where((out > lowest) & (out == best[b]), index, num_edges)
+        pick = jnp.full(num_nodes, num_edges, jnp.int32).at[a].min(at_a).at[b].min(at_b)
+        chosen = jnp.minimum(pick, num_edges - 1)
+        to = jnp.where(a[chosen] == nodes, b[chosen], a[chosen])
+        hooks = (pick < num_edges) & ~source
+        # Two trees that choose the same edge: the one of the lower root stays.
+        hooks = hooks & ~((pick[to] == pick) & ~source[to] & (nodes < to))
+        to = jnp.where(hooks, to, nodes)
+        up, edge = jnp.where(hooks, to, up), jnp.where(hooks, pick, edge)
+        return _ends(to)[root], up, edge, jnp.any(hooks)
+
+    start = nodes, nodes, jnp.full_like(nodes, -1), jnp.array(True)
+    _, up, edge, _ = jax.lax.while_loop(lambda c: c[3], hook, start)
+
+    def double(
+        carry: tuple[jax.Array, jax.Array, jax.Array, jax.Array],
+    ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+        up, least, edge, _ = carry
+        weaker = least[up] < least
+        least = jnp.where(weaker, least[up], least)
+        edge = jnp.where(weaker, edge[up], edge)
+        return up[up], least, edge, jnp.any(up[up] != up)
+
+    least = jnp.where(edge < 0, lowest, strength[edge])
+    least = jnp.where(source, jnp.inf, least)
+    carry = up, least, edge, jnp.array(True)
+    _, least, edge, _ = jax.lax.while_loop(lambda c: c[3], double, carry)
+    finite = jnp.isfinite(least)
+    return jnp.where(finite, weight[edge], least), jnp.where(finite, edge, -1)
+
+
+def _ends(pointer: jax.Array) -> jax.Array:
+    """Follow (N,) pointers to where they end."""
+
+    def jump(carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        pointer, _ = carry
+        further = pointer[pointer]
+        return further, jnp.any(further != pointer)
+
+    start = (pointer, jnp.array(True))
+    return jax.lax.while_loop(lambda c: c[1], jump, start)[0]
 
 
 def group_sum(values: jax.Array, group: jax.Array, num_groups: int) -> jax.Array:
