@@ -12,9 +12,14 @@ from typing import Any
 import jax
 import numpy as np
 
-from blastjax.author.descriptions import Bonds, Chunks, checked_bonds, checked_chunks
+from blastjax.author.descriptions import (
+    Bonds,
+    Chunks,
+    checked_bonds,
+    checked_chunks,
+    refuse,
+)
 from blastjax.author.descriptions import depths as chunk_depths
-from blastjax.author.descriptions import refuse
 from blastjax.author.mesh import Mesh
 from blastjax.core import NO_WORLD, NONE, WORLD, Asset, State
 
@@ -149,7 +154,7 @@ def refuse_meshes(meshes: Sequence[Mesh], chunks: int | None = None) -> None:
                 )
         bad = ~np.isfinite(vertices).all(axis=1)
         refuse(bad, vertices, f"mesh {i}: vertex {{i}} is {{v}}; it must be finite")
-        bad = ((faces < 0) | (faces >= len(vertices))).any(axis=1)
+        bad = np.any((faces < 0) | (faces >= len(vertices)), axis=1)
         refuse(
             bad,
             faces,
@@ -187,8 +192,10 @@ def _shaped(
                 "axes: of a batch, take one"
             )
         for letter, length in zip(letters, array.shape, strict=True):
-            fixed = isinstance(letter, int)
-            size = letter if fixed else sizes.setdefault(letter, length)
+            if isinstance(letter, int):
+                size = letter
+            else:
+                size = sizes.setdefault(letter, length)
             if length != size:
                 raise ValueError(
                     f"{kind}.{field.name} has shape {array.shape}; "
@@ -202,8 +209,8 @@ def _shaped(
 
 
 def _refuse_range(name: str, values: np.ndarray, least: int, end: int) -> None:
-    bad = (values < least) | (values >= end)
-    bad = bad.reshape(len(bad), -1).any(axis=1)
+    out = (values < least) | (values >= end)
+    bad = np.any(out.reshape(len(out), -1), axis=1)
     refuse(bad, values, f"{name}[{{i}}] is {{v}}; it must lie in {least}..{end - 1}")
 
 

@@ -86,7 +86,7 @@ def bottleneck(
 
     Args:
       edges: (B, 2) nodes.
-      weight: (B,) strength, any sign; minus infinity or NaN for edges that lead nowhere.
+      weight: (B,) strength, any sign; minus infinity or NaN if an edge leads nowhere.
       source: (N,) bool, the nodes to reach.
       num_nodes: N.
 
