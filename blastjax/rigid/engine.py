@@ -6,8 +6,8 @@ between releases, so they are all called here, and `tests/test_rigid.py` watches
 Every function maps (model, data) to data, as MJX's do.
 """
 
+import dataclasses
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +24,8 @@ from mujoco.mjx._src import (
 )
 from mujoco.mjx._src import math as mjx_math
 
-Collider = Callable[..., tuple[jax.Array, jax.Array, jax.Array]]
+Points = tuple[jax.Array, jax.Array, jax.Array]
+"""Distance (n,) m, position (n, 3) m and frame (n, 3, 3) of contacts."""
 
 _UPPER = ((0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2))
 
@@ -78,17 +79,47 @@ def geom_pairs(model: mujoco.MjModel) -> np.ndarray:
     return np.array(pairs, dtype=int).reshape(-1, 2)
 
 
-def contact_groups(model: mjx.Model, data: mjx.Data) -> list[tuple[Any, Any, Collider]]:
-    """Return (key, contacts, collider) for each kind of geom pair in the model.
+@dataclasses.dataclass(frozen=True)
+class Group:
+    """The pairs of geoms of one kind, on the host."""
 
-    The contacts have their parameters and their two geoms, one row a pair; distance,
-    position and frame are for the collider to find.
+    types: tuple[int, int]
+    """Types of the two geoms."""
+    condim: int
+    """Dimension of their contacts."""
+    pair: np.ndarray
+    """(pairs, 2) geoms."""
+    count: int
+    """Contacts that MJX finds for a pair."""
+    find: Callable[[mjx.Model, mjx.Data, jax.Array], Points]
+    """MJX's collider: of pairs (n, 2) it finds count contacts each."""
+
+
+def contact_groups(model: mjx.Model, data: mjx.Data) -> list[tuple[Group, mjx.Contact]]:
+    """Return the kinds of geom pairs in the model, with their contacts' parameters.
+
+    The contacts have one row a pair; distance, position and frame are for a collider to
+    find.
     """
-    groups = collision_driver._contact_groups(model, data)
-    return [
-        (key, contacts, collision_driver._COLLISION_FUNC[key.types])
-        for key, contacts in groups.items()
-    ]
+    pairs = collision_driver._geom_groups(model)
+    found = []
+    for key, contacts in collision_driver._contact_groups(model, data).items():
+        collider = collision_driver._COLLISION_FUNC[key.types]
+        group = Group(
+            types=(int(key.types[0]), int(key.types[1])),
+            condim=int(key.condim),
+            pair=np.array(pairs[key])[:, :2],
+            count=collider.ncon,
+            find=_with_key(collider, key),
+        )
+        found.append((group, contacts))
+    return found
+
+
+def _with_key(
+    collider: Callable[..., Points], key: collision_driver.FunctionKey
+) -> Callable[[mjx.Model, mjx.Data, jax.Array], Points]:
+    return lambda model, data, pair: collider(model, data, key, pair)
 
 
 def contact_frame(normal: jax.Array) -> jax.Array:
@@ -167,6 +198,30 @@ def normal_force(data: mjx.Data) -> jax.Array:
         parts.append(block.reshape(count, rows).sum(axis=1))
         start += count * rows
     return jnp.concatenate(parts)
+
+
+def contact_force(data: mjx.Data) -> jax.Array:
+    """Return the force of each contact on its second geom, (contacts, 3) N, world axes.
+
+    Friction of rolling and twisting is left out.
+    """
+    impl = data._impl
+    touch, start = impl.contact, impl.ne + impl.nf + impl.nl
+    parts = []
+    for size in (1, 3, 4, 6):
+        count = int(np.sum(touch.dim == size))
+        rows = 1 if size == 1 else 2 * (size - 1)
+        block = impl.efc_force[start : start + count * rows].reshape(count, rows)
+        start += count * rows
+        local = jnp.zeros((count, 3), block.dtype).at[:, 0].set(block.sum(axis=1))
+        if size > 1:
+            # Opposite edges of the pyramid: their difference is the friction.
+            edges = block[:, :4].reshape(count, 2, 2)
+            local = local.at[:, 1:].set(edges[..., 0] - edges[..., 1])
+        parts.append(local)
+    local = jnp.concatenate(parts)
+    local = local.at[:, 1:].multiply(touch.friction[:, :2])
+    return jnp.einsum("ni,nij->nj", local, touch.frame)
 
 
 def integrate(model: mjx.Model, data: mjx.Data) -> mjx.Data:
