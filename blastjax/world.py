@@ -16,7 +16,7 @@ from mujoco import mjx
 from blastjax import chunks, fracture, graph, pytree, spatial
 from blastjax.core import NONE, Damage, FractureEvents, SplitEvents, State
 from blastjax.damage import falloff
-from blastjax.rigid import bodies, contact, engine, solver
+from blastjax.rigid import bodies, contact, engine, rows, solver
 from blastjax.rigid.scene import Scene
 from blastjax.stress.equilibrium import Structure
 from blastjax.stress.failure import Verdict, judge, stress_damage
@@ -219,10 +219,9 @@ def step(
     data = bodies.place(scene, riding, data)
     data = bodies.kinematics(scene, model, riding, data)
     data, found = contact.collide(scene, riding, model, data)
-    data = engine.constraint_rows(model, data, found.riders.body)
     data = engine.position_sensors(model, data)
     data = engine.smooth_acceleration(model, data, bodies.empty_dofs(scene, riding))
-    data, report = contact.resolve(model, data, scene.line_search)
+    data, report = rows.resolve(scene, model, data, riding, frames, found.riders)
     data = engine.integrate(model, data)
     force = contact.normal_force(data)
 
