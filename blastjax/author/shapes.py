@@ -11,6 +11,7 @@ import numpy as np
 
 from blastjax.author.asset import build
 from blastjax.author.descriptions import Bonds, Chunks, reals, refuse
+from blastjax.author.overlap import box_pairs
 from blastjax.core import NO_PARENT, WORLD, Asset
 
 SIDES = ("x-", "x+", "y-", "y+", "z-", "z+")
@@ -227,28 +228,23 @@ def _pieces(
 def _touching(center: np.ndarray, size: np.ndarray) -> Bonds:
     """Return the bonds of boxes that share part of a face."""
     tolerance = 1e-6 * size.min()
-    pairs, normals, areas, centroids = [], [], [], []
     low, high = center - size, center + size
+    met = box_pairs(low, high, tolerance)
+    pairs, normals, areas, centroids = [], [], [], []
     for axis in range(3):
         others = [i for i in range(3) if i != axis]
-        # Boxes that end and boxes that begin at the same plane, plane by plane.
-        planes = np.round(np.concatenate([high[:, axis], low[:, axis]]) / tolerance)
-        _, group = np.unique(planes, return_inverse=True)
-        ends, begins = group[: len(center)], group[len(center) :]
-        for plane in np.intersect1d(ends, begins):
-            a, b = np.flatnonzero(ends == plane), np.flatnonzero(begins == plane)
-            from_ = np.maximum(low[a][:, None], low[b][None])[:, :, others]
-            to = np.minimum(high[a][:, None], high[b][None])[:, :, others]
-            i, j = np.nonzero((to - from_ > tolerance).all(axis=2))
-            middle = np.zeros((len(i), 3))
-            middle[:, others] = ((from_ + to) / 2)[i, j]
-            middle[:, axis] = high[a[i], axis]
-            pairs.append(np.stack([a[i], b[j]], axis=1))
-            normals.append(np.tile(np.eye(3)[axis], (len(i), 1)))
-            areas.append(np.prod((to - from_)[i, j], axis=1))
+        for a, b in (met.T, met[:, ::-1].T):
+            touch = np.abs(high[a, axis] - low[b, axis]) <= tolerance
+            a, b = a[touch], b[touch]
+            from_, to = np.maximum(low[a], low[b]), np.minimum(high[a], high[b])
+            share = ((to - from_)[:, others] > tolerance).all(axis=1)
+            a, b, from_, to = a[share], b[share], from_[share], to[share]
+            middle = (from_ + to) / 2
+            middle[:, axis] = high[a, axis]
+            pairs.append(np.stack([a, b], axis=1))
+            normals.append(np.tile(np.eye(3)[axis], (len(a), 1)))
+            areas.append(np.prod((to - from_)[:, others], axis=1))
             centroids.append(middle)
-    if not pairs:
-        return Bonds.none()
     return Bonds(*(np.concatenate(x) for x in (pairs, normals, areas, centroids)))
 
 
