@@ -51,7 +51,7 @@ def boxes(
     unknown = [side for side in anchor if side not in SIDES]
     if unknown:
         raise ValueError(f"anchor {unknown[0]!r} is no side; give any of {SIDES}")
-    pieces = _counts("pieces", pieces, 3)
+    pieces = counts("pieces", pieces, 3)
 
     bonds = [_touching(center, size), *(_anchored(center, size, s) for s in anchor)]
     offset = 1 if root else 0
@@ -92,8 +92,8 @@ def grid(
       brick: extent of one box, m.
       **options: of `boxes`.
     """
-    counts = _counts("shape", shape, 3)
-    return boxes(*_lattice(counts, _extent(brick)), **options)
+    number = counts("shape", shape, 3)
+    return boxes(*_lattice(number, extent_of(brick)), **options)
 
 
 def beam(
@@ -131,8 +131,8 @@ def tower(
       anchor: see `boxes`.
       **options: of `boxes`.
     """
-    levels, side = _counts("levels and side", (levels, side), 2)
-    center, size = _lattice((side, side, levels), _extent(brick))
+    levels, side = counts("levels and side", (levels, side), 2)
+    center, size = _lattice((side, side, levels), extent_of(brick))
     edge = (side - 1) / 2 * np.asarray(brick[:2], float)
     outer = (np.abs(center[:, :2]) > edge - 1e-9 * np.asarray(brick[:2])).any(axis=1)
     return boxes(center[outer], size[outer], anchor=anchor, **options)
@@ -157,8 +157,8 @@ def wall(
       anchor: see `boxes`.
       **options: of `boxes`.
     """
-    bricks, courses = _counts("bricks and courses", (bricks, courses), 2)
-    extent = _extent(brick)
+    bricks, courses = counts("bricks and courses", (bricks, courses), 2)
+    extent = extent_of(brick)
     center, size = [], []
     for course in range(courses):
         cuts = np.arange(bricks + 1.0)
@@ -175,7 +175,8 @@ def wall(
     return boxes(np.concatenate(center), np.concatenate(size), anchor=anchor, **options)
 
 
-def _counts(name: str, values: Sequence[int], number: int) -> tuple[int, ...]:
+def counts(name: str, values: Sequence[int], number: int) -> tuple[int, ...]:
+    """Return whole numbers from 1, or raise ValueError."""
     if len(values) != number:
         raise ValueError(f"{name} has {len(values)} numbers; give {number}")
     for i, value in enumerate(values):
@@ -186,18 +187,17 @@ def _counts(name: str, values: Sequence[int], number: int) -> tuple[int, ...]:
     return tuple(int(value) for value in values)
 
 
-def _extent(brick: Sequence[float]) -> np.ndarray:
+def extent_of(brick: Sequence[float]) -> np.ndarray:
+    """Return the extents of a brick, or raise ValueError."""
     extent = reals("brick", np.asarray(brick), (3,))
     refuse(extent <= 0, extent, "brick[{i}] is {v}; an extent is positive, in m")
     return extent
 
 
-def _lattice(
-    counts: Sequence[int], extent: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    index = np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), axis=-1)
-    center = (index.reshape(-1, 3) - (np.asarray(counts) - 1) / 2) * extent
-    center[:, 2] += counts[2] * extent[2] / 2
+def _lattice(shape: Sequence[int], extent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    index = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1)
+    center = (index.reshape(-1, 3) - (np.asarray(shape) - 1) / 2) * extent
+    center[:, 2] += shape[2] * extent[2] / 2
     return center, np.tile(extent / 2, (len(center), 1))
 
 
