@@ -40,7 +40,7 @@ def ensure_coverage(parent: np.ndarray, support: np.ndarray) -> tuple[np.ndarray
     support = flags("chunk support", support, len(parent))
     covered = _covered(parent, support)
     kept = support & ~covered
-    has_support = _subtree_any(parent, kept)
+    has_support = subtree_any(parent, kept)
     root = parent < 0
     # Not below support, nothing below itself, and the chunk above cannot take the flag.
     missing = ~has_support & ~covered & (root | has_support[parent])
@@ -177,7 +177,7 @@ def _covered(parent: np.ndarray, support: np.ndarray) -> np.ndarray:
     return found
 
 
-def _subtree_any(parent: np.ndarray, flag: np.ndarray) -> np.ndarray:
+def subtree_any(parent: np.ndarray, flag: np.ndarray) -> np.ndarray:
     """Return which chunks have a flagged chunk at or below them."""
     above, found = parent, flag
     while (above >= 0).any():

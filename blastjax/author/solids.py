@@ -4,6 +4,7 @@ A *solid* is a list of faces, each a row of corners in a plane, counter-clockwis
 from outside.
 """
 
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,13 +12,19 @@ import numpy as np
 
 from blastjax.author import bonds as find
 from blastjax.author.asset import Built, build
-from blastjax.author.descriptions import Bonds, Chunks
+from blastjax.author.descriptions import Bonds, Chunks, refuse
 from blastjax.author.mesh import Destructible, Mesh, moments
 from blastjax.core import NO_PARENT
 
 # Corners in binary order of (x, y, z) low or high.
-_BOX_FACES = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4))
-_BOX_FACES += ((1, 5, 7, 3),)
+_BOX_FACES = (
+    (0, 1, 3, 2),
+    (4, 6, 7, 5),
+    (0, 4, 5, 1),
+    (2, 3, 7, 6),
+    (0, 2, 6, 4),
+    (1, 5, 7, 3),
+)
 _CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
 
 
@@ -34,7 +41,7 @@ def solid(faces: Sequence[Any]) -> Mesh:
     for row in rows:
         corner = place[start : start + len(row)]
         start += len(row)
-        triangles += [(corner[0], b, c) for b, c in zip(corner[1:], corner[2:])]  # noqa: B905
+        triangles += [(corner[0], b, c) for b, c in itertools.pairwise(corner[1:])]
     kept = [t for t in triangles if len(set(t)) == 3]
     return Mesh(points[first], np.array(kept, np.int32).reshape(-1, 3))
 
@@ -75,29 +82,28 @@ def equal_box(volume: np.ndarray, inertia: np.ndarray) -> np.ndarray:
     return half * scale[:, None]
 
 
-def described(
-    meshes: Sequence[Mesh], parent: Any = None, support: Any = None
-) -> Chunks:
+def describe(meshes: Sequence[Mesh], parent: Any = None, support: Any = None) -> Chunks:
     """Return descriptions of chunks with exact volume, centre, inertia and their box.
 
     Raises:
       ValueError: a mesh has no volume, or is inside out.
     """
     found = [moments(mesh) for mesh in meshes]
-    for i, (volume, _, _) in enumerate(found):
-        if not volume > 0:
-            raise ValueError(
-                f"mesh {i} has volume {volume}; it must be closed, its faces "
-                "counter-clockwise seen from outside"
-            )
-    volume, centroid, inertia = (np.array(x) for x in zip(*found, strict=True))
+    volume = np.array([x[0] for x in found])
+    refuse(
+        ~(volume > 0),
+        volume,
+        "mesh {i} has volume {v}; it must be closed, its faces counter-clockwise seen "
+        "from outside",
+    )
+    centroid, inertia = (np.array([x[i] for x in found]) for i in (1, 2))
     if parent is None:
         parent = np.full(len(meshes), NO_PARENT)
     size = equal_box(volume, inertia)
     return Chunks(parent, centroid, volume, support, size, inertia)
 
 
-def assembled(
+def assemble(
     meshes: Sequence[Mesh],
     bonds: Bonds | None = None,
     *,
@@ -113,7 +119,7 @@ def assembled(
       dtype: see `author.build`.
     """
     bonds = find.between(meshes) if bonds is None else bonds
-    built = build(described(meshes), find.together(bonds, *world), dtype=dtype)
+    built = build(describe(meshes), find.together(bonds, *world), dtype=dtype)
     return Destructible(built.asset, in_order(built, meshes))
 
 

@@ -60,7 +60,7 @@ def _holes(
 ) -> list[tuple[float, int, float, int]]:
     """Return the openings, x in bricks from the left end and z in courses."""
     rows = reals("openings", np.reshape(openings, (-1, 4)), (len(openings), 4))
-    holes = []
+    holes: list[tuple[float, int, float, int]] = []
     for i, (x0, z0, x1, z1) in enumerate(rows.tolist()):
         a, b = (float(x / extent[0] + bricks / 2) for x in (x0, x1))
         low, high = (round(float(z / extent[2])) for z in (z0, z1))

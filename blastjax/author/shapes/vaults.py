@@ -1,5 +1,6 @@
 """Things of cut stone: arch, dome, column, bridge. Their pieces are convex solids."""
 
+import itertools
 from typing import Any
 
 import numpy as np
@@ -48,7 +49,7 @@ def arch(
             normal = -normal
         point = (inner[end][0], 0.0, inner[end][1])
         held.append(bonds.to_plane(meshes, point, normal, facing=1 - 1e-9))
-    return solids.assembled(meshes, world=held, dtype=dtype)
+    return solids.assemble(meshes, world=held, dtype=dtype)
 
 
 def dome(
@@ -101,7 +102,7 @@ def dome(
     if not oculus:
         meshes.append(solids.prism(within[-1, :-1], beyond[-1, :-1]))
     held = [bonds.to_plane(meshes, (0, 0, 0), DOWN)] if anchor else []
-    return solids.assembled(meshes, world=held, dtype=dtype)
+    return solids.assemble(meshes, world=held, dtype=dtype)
 
 
 def column(
@@ -156,7 +157,7 @@ def column(
             low, high = (np.concatenate(x) for x in zip(axis, rim, strict=True))
             meshes.append(solids.prism(low, high))
     held = [bonds.to_plane(meshes, (0, 0, 0), DOWN)] if anchor else []
-    return solids.assembled(meshes, world=held, dtype=dtype)
+    return solids.assemble(meshes, world=held, dtype=dtype)
 
 
 def bridge(
@@ -223,7 +224,7 @@ def bridge(
             meshes.append(_slab([tuple(a), tuple(b), *top], width))
             meshes.append(_box(a[0], b[0], road, road + deck, width))
     held = [bonds.to_plane(meshes, (0, 0, 0), DOWN)] if anchor else []
-    return solids.assembled(meshes, world=held, dtype=dtype)
+    return solids.assemble(meshes, world=held, dtype=dtype)
 
 
 def _pier(
@@ -237,12 +238,11 @@ def _pier(
     courses: int,
     width: float,
 ) -> list[Mesh]:
-    """Return a pier's stones, the stone that the arches spring from, and those above."""
+    """Return a pier's stones, the one that arches spring from, and those above."""
     right = left + pier
     levels = np.linspace(0, height, courses + 1)
     meshes = [
-        _box(left, right, low, high, width)
-        for low, high in zip(levels[:-1], levels[1:], strict=True)
+        _box(left, right, low, high, width) for low, high in itertools.pairwise(levels)
     ]
     in_left, in_right = left + skew[0], right - skew[1]
     # Where arches are half circles they spring from a level bed.
