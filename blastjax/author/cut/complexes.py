@@ -5,6 +5,7 @@ of a solid fits together exactly, also after every vertex was moved by noise.
 """
 
 import dataclasses
+import itertools
 from typing import Any
 
 import numpy as np
@@ -50,11 +51,13 @@ def voronoi(points: np.ndarray, low: np.ndarray, high: np.ndarray) -> Complex:
     center, radius = (low + high) / 2, np.linalg.norm(high - low) / 2
     local = (points - center) / radius
     found = spatial.Voronoi(np.concatenate([local, REACH * _icosahedron()]))
-    triangles, cells, facet = [], [], []
+    triangles: list[tuple[int, int, int]] = []
+    cells: list[np.ndarray] = []
+    facet: list[int] = []
     for pair, ring in zip(found.ridge_points, found.ridge_vertices, strict=True):
         if pair.min() >= len(points):
             continue
-        fan = [(ring[0], a, b) for a, b in zip(ring[1:-1], ring[2:], strict=True)]
+        fan = [(ring[0], a, b) for a, b in itertools.pairwise(ring[1:])]
         corners = found.vertices[ring]
         normal = np.cross(
             corners - corners[0], np.roll(corners, -1, axis=0) - corners[0]
@@ -63,7 +66,7 @@ def voronoi(points: np.ndarray, low: np.ndarray, high: np.ndarray) -> Complex:
         order = pair if normal @ across > 0 else pair[::-1]
         triangles += fan
         cells += [np.where(order < len(points), order, NONE)] * len(fan)
-        facet += [len(facet) and facet[-1] + 1] * len(fan)
+        facet += [facet[-1] + 1 if facet else 0] * len(fan)
     return Complex(
         found.vertices * radius + center,
         np.array(triangles, np.int64),
@@ -111,9 +114,7 @@ def from_polygons(
 ) -> Complex:
     """Return the complex whose facets are these convex polygons."""
     triangles = [
-        (ring[0], a, b)
-        for ring in polygons
-        for a, b in zip(ring[1:-1], ring[2:], strict=True)
+        (ring[0], a, b) for ring in polygons for a, b in itertools.pairwise(ring[1:])
     ]
     facet = np.repeat(np.arange(len(polygons)), [len(ring) - 2 for ring in polygons])
     return Complex(

@@ -51,22 +51,21 @@ def _cross(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def _pierces(start: np.ndarray, end: np.ndarray, triangle: np.ndarray) -> np.ndarray:
-    def volume(
-        a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray
-    ) -> np.ndarray:
-        return np.einsum("ki,ki->k", b - a, np.cross(c - a, d - a))
-
     p, q, r = np.moveaxis(triangle, 1, 0)
     size = np.linalg.norm(end - start, axis=1) * np.linalg.norm(q - p, axis=1)
     size *= np.linalg.norm(r - p, axis=1)
     # What touches by rounding alone does not cross.
     slack = 1e-9 * size
-    before, behind = volume(start, p, q, r), volume(end, p, q, r)
-    apart = (before > slack) & (behind < -slack) | (before < -slack) & (behind > slack)
+    before, behind = _volume(start, p, q, r), _volume(end, p, q, r)
+    apart = (before > slack) & (behind < -slack)
+    apart |= (before < -slack) & (behind > slack)
     sides = np.stack(
-        [volume(start, end, a, b) for a, b in ((p, q), (q, r), (r, p))], axis=1
+        [_volume(start, end, a, b) for a, b in ((p, q), (q, r), (r, p))], axis=1
     )
-    within = (sides > slack[:, None]).all(axis=1) | (sides < -slack[:, None]).all(
-        axis=1
-    )
-    return apart & within
+    slack = slack[:, None]
+    return apart & ((sides > slack).all(axis=1) | (sides < -slack).all(axis=1))
+
+
+def _volume(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> np.ndarray:
+    """Return six times the signed volume of tetrahedra, corners (K, 3) each."""
+    return np.einsum("ki,ki->k", b - a, np.cross(c - a, d - a))

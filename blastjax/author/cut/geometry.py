@@ -64,7 +64,8 @@ def mesh(solid: Any, skin: int) -> tuple[Mesh, np.ndarray]:
     """
     raw = solid.to_mesh64()
     faces = np.asarray(raw.tri_verts, np.int32)
-    counts = np.diff(np.asarray(raw.run_index, np.int64)) // 3
+    starts = np.asarray(raw.run_index, np.int64) // 3
+    counts = starts[1:] - starts[:-1]
     original = np.repeat(np.asarray(raw.run_original_id, np.int64), counts)
     facet = np.where(original == skin, SKIN, np.asarray(raw.face_id, np.int64))
     vertices = np.array(raw.vert_properties[:, :3], np.float64)
@@ -80,3 +81,28 @@ def bounds(solid: Any) -> tuple[np.ndarray, np.ndarray]:
 def extent(vertices: np.ndarray) -> np.ndarray:
     """Return the extents of points along x, y and z, (3,)."""
     return vertices.max(axis=0) - vertices.min(axis=0)
+
+
+def contains(mesh: Mesh, points: np.ndarray) -> np.ndarray:
+    """Return which points (P, 3) lie inside a closed mesh, (P,) bool.
+
+    Counts the faces above each point, those that look up for and those that look down
+    against. Only points exactly above an edge can be wrong.
+    """
+    shapely = need("shapely")
+    corners = mesh.vertices[mesh.faces]
+    low, high = corners.min(axis=1), corners.max(axis=1)
+    boxes = shapely.box(low[:, 0], low[:, 1], high[:, 0], high[:, 1])
+    point, face = shapely.STRtree(boxes).query(shapely.points(points[:, :2]))
+    a, b, c = np.moveaxis(corners[face] - points[point][:, None], 1, 0)
+
+    def turn(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        return first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
+
+    weight = np.stack([turn(b, c), turn(c, a), turn(a, b)], axis=1)
+    total = weight.sum(axis=1)
+    sign = np.sign(total)
+    hit = (weight * sign[:, None] > 0).all(axis=1)
+    height = np.stack([a[:, 2], b[:, 2], c[:, 2]], axis=1)
+    above = hit & (np.einsum("ki,ki->k", weight, height) * sign > 0)
+    return np.bincount(point[above], sign[above], len(points)) > 0.5

@@ -62,7 +62,7 @@ def grid(axes: list[np.ndarray], label: np.ndarray) -> Complex:
     """Return the cells that boxes of a grid with one label make together.
 
     Args:
-      axes: three rising arrays (X + 1,), (Y + 1,), (Z + 1,) where the grid's planes are.
+      axes: where the grid's planes are: rising arrays (X + 1,), (Y + 1,), (Z + 1,).
       label: (X, Y, Z) cell of each box.
     """
     shape = np.array([len(axis) for axis in axes])

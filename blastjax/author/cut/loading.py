@@ -47,7 +47,8 @@ def solid(
         raise ValueError(f"scale is {scale}; it must be a factor above 0")
     vertices, faces = _arrays(mesh)
     _refuse_malformed(vertices, faces)
-    vertices, warnings = vertices * scale, []
+    vertices = vertices * scale
+    warnings: list[str] = []
     _check_size(vertices[np.unique(faces)], warnings)
     vertices, faces = _closed(vertices, faces, repair, warnings)
     body, skin = _body(vertices, faces)

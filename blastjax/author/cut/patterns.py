@@ -120,7 +120,7 @@ def slices(
             "[0, 1] and [0, pi / 2)"
         )
     rng = np.random.default_rng(seed)
-    cutters: dict[int, Sequence[Complex]] = {}
+    cutters = {}
     for piece in chosen(tree, pieces):
         box = low, high = tree.bounds(piece)
         planes = []

@@ -119,7 +119,8 @@ def _extrude(
     """Return prisms over polygons, whose rings have their points at `place`."""
     triangulate = geometry.need("manifold3d").triangulate
     count, at = len(points), 0
-    caps, cap_cells, sides = [], [], {}
+    caps, cap_cells = [], []
+    sides: dict[tuple[int, int], int] = {}
     for cell, polygon in enumerate(rings):
         start = at
         for ring in polygon:

@@ -70,7 +70,7 @@ def clustered(
 
     def draw(rng: np.random.Generator, tree: Tree, piece: int) -> np.ndarray:
         low, high = tree.bounds(piece)
-        reach = spread * np.linalg.norm(high - low)
+        reach = spread * float(np.linalg.norm(high - low))
         centers = _inside(tree, piece, clusters, _evenly(rng, low, high))
         return np.concatenate(
             [
@@ -131,31 +131,6 @@ def radial(
     return np.concatenate([center[None], center + far[:, None] * arms])
 
 
-def contains(mesh: Mesh, points: np.ndarray) -> np.ndarray:
-    """Return which points (P, 3) lie inside a closed mesh, (P,) bool.
-
-    Counts the faces above each point, those that look up for and those that look down
-    against. Only points exactly above an edge can be wrong.
-    """
-    shapely = geometry.need("shapely")
-    corners = mesh.vertices[mesh.faces]
-    low, high = corners.min(axis=1), corners.max(axis=1)
-    boxes = shapely.box(low[:, 0], low[:, 1], high[:, 0], high[:, 1])
-    point, face = shapely.STRtree(boxes).query(shapely.points(points[:, :2]))
-    a, b, c = np.moveaxis(corners[face] - points[point][:, None], 1, 0)
-
-    def turn(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        return first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
-
-    weight = np.stack([turn(b, c), turn(c, a), turn(a, b)], axis=1)
-    total = weight.sum(axis=1)
-    sign = np.sign(total)
-    hit = (weight * sign[:, None] > 0).all(axis=1)
-    height = np.stack([a[:, 2], b[:, 2], c[:, 2]], axis=1)
-    above = hit & (np.einsum("ki,ki->k", weight, height) * sign > 0)
-    return np.bincount(point[above], sign[above], len(points)) > 0.5
-
-
 def _inside(
     tree: Tree, piece: int, count: int, draw: Callable[[int], np.ndarray]
 ) -> np.ndarray:
@@ -163,7 +138,7 @@ def _inside(
     mesh, found = tree.mesh(piece), np.zeros((0, 3))
     for _ in range(TRIES):
         points = draw(2 * count)
-        found = np.concatenate([found, points[contains(mesh, points)]])
+        found = np.concatenate([found, points[geometry.contains(mesh, points)]])
         if len(found) >= count:
             return found[:count]
     raise ValueError(

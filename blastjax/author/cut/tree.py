@@ -1,7 +1,7 @@
 """The tree of pieces that cuts make of a solid."""
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -82,7 +82,7 @@ def chosen(tree: Tree, pieces: Sequence[int] | None) -> np.ndarray:
     return np.unique(numbers).astype(int)
 
 
-def cut(tree: Tree, cutters: dict[int, Sequence[Complex]]) -> Tree:
+def cut(tree: Tree, cutters: Mapping[int, Sequence[Complex]]) -> Tree:
     """Return the tree with the given leaves cut by one complex after the other.
 
     All that the complexes make of a leaf becomes its children. Parts of one cell that
@@ -104,7 +104,7 @@ def cut(tree: Tree, cutters: dict[int, Sequence[Complex]]) -> Tree:
         parts = [
             island
             for part in parts
-            for island in part.decompose()
+            for island in _islands(part)
             if island.volume() > smallest
         ]
         if len(parts) > 1:
@@ -127,3 +127,28 @@ def _divide(part: Any, cells: list[Any]) -> Iterator[Any]:
             if (least <= high).all() and (most >= low).all()
         ]
     yield from (each for each in met if not each.is_empty())
+
+
+def _islands(part: Any) -> list[Any]:
+    """Return the parts of a body that hang together, each with its own cavities."""
+    shells = part.decompose()
+    solids = [shell for shell in shells if shell.volume() > 0]
+    cavities = [shell for shell in shells if shell.volume() < 0]
+    if not cavities or len(solids) < 2:
+        return solids if not cavities else [part]
+    meshes = [Mesh(*_arrays(shell), None) for shell in solids]
+    inside: list[list[Any]] = [[shell] for shell in solids]
+    for cavity in cavities:
+        probe = _arrays(cavity)[0][:1]
+        around = [
+            i for i, mesh in enumerate(meshes) if geometry.contains(mesh, probe)[0]
+        ]
+        # Of shells within each other the innermost has the cavity.
+        inside[min(around, key=lambda i: solids[i].volume())].append(cavity)
+    compose = geometry.need("manifold3d").Manifold.compose
+    return [compose(each) for each in inside]
+
+
+def _arrays(shell: Any) -> tuple[np.ndarray, np.ndarray]:
+    raw = shell.to_mesh64()
+    return np.array(raw.vert_properties[:, :3]), np.asarray(raw.tri_verts, np.int32)
