@@ -9,7 +9,6 @@ import numpy as np
 from blastjax.author.cut import geometry
 from blastjax.author.cut.tree import Tree, chosen
 from blastjax.author.descriptions import reals
-from blastjax.author.mesh import Mesh
 
 TRIES = 200
 """Batches of random points in a piece before it counts as too thin."""

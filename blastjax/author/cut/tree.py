@@ -136,19 +136,12 @@ def _islands(part: Any) -> list[Any]:
     cavities = [shell for shell in shells if shell.volume() < 0]
     if not cavities or len(solids) < 2:
         return solids if not cavities else [part]
-    meshes = [Mesh(*_arrays(shell), None) for shell in solids]
+    meshes = [geometry.mesh(shell, 0)[0] for shell in solids]
     inside: list[list[Any]] = [[shell] for shell in solids]
     for cavity in cavities:
-        probe = _arrays(cavity)[0][:1]
-        around = [
-            i for i, mesh in enumerate(meshes) if geometry.contains(mesh, probe)[0]
-        ]
+        probe = geometry.mesh(cavity, 0)[0].vertices[:1]
+        around = [i for i, mesh in enumerate(meshes) if geometry.contains(mesh, probe)]
         # Of shells within each other the innermost has the cavity.
         inside[min(around, key=lambda i: solids[i].volume())].append(cavity)
     compose = geometry.need("manifold3d").Manifold.compose
     return [compose(each) for each in inside]
-
-
-def _arrays(shell: Any) -> tuple[np.ndarray, np.ndarray]:
-    raw = shell.to_mesh64()
-    return np.array(raw.vert_properties[:, :3]), np.asarray(raw.tri_verts, np.int32)
