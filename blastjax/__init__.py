@@ -7,7 +7,17 @@ Importing this loads jax and numpy only. The rooms that need MuJoCo, Brax or gym
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from blastjax import author, chunks, core, damage, fracture, graph, spatial, stress
+from blastjax import (
+    author,
+    chunks,
+    core,
+    damage,
+    fracture,
+    graph,
+    soft,
+    spatial,
+    stress,
+)
 from blastjax.core import Asset, Damage, State
 
 if TYPE_CHECKING:
@@ -28,6 +38,7 @@ __all__ = [
     "graph",
     "render",
     "rigid",
+    "soft",
     "spatial",
     "stress",
     "world",
