@@ -89,7 +89,7 @@ def evolve(
 
     def step(now: Evolution, _: None) -> tuple[Evolution, None]:
         left = length
-        for _ in range(crossings):
+        for _crossing in range(crossings):
             now, left = _to_crossing(motion, now, left)
         return _to_end(motion, now, left), None
 
@@ -137,7 +137,8 @@ def _to_crossing(
         return jnp.where(broken, low, middle), jnp.where(broken, middle, high)
 
     digits = 1 + jnp.finfo(now.health.dtype).nmant
-    low, high = jax.lax.fori_loop(0, digits, halve, (jnp.zeros_like(span), span))
+    bracket = jnp.zeros_like(span), span
+    high = jax.lax.fori_loop(0, digits, halve, bracket)[1]
     reached = _advance(motion, fixed, high)[1]
     broken = fixed.intact & (reached <= 0) & crosses
     first = jnp.argmin(jnp.where(fixed.intact, reached, jnp.inf))

@@ -1,4 +1,4 @@
-"""A soft relaxation of fracture: a model of its own, not the derivative of the hard one.
+"""A soft relaxation of fracture: a model of its own, not the hard one's derivative.
 
 Bonds hold by a weight between 0 and 1, and chunks share their momentum through bonds in
 proportion to it. With weights of 0 and 1 and a large stiffness the pieces move as rigid
@@ -117,7 +117,7 @@ def _inertia_matrix(mass: jax.Array, inertia: jax.Array) -> jax.Array:
 
 
 def _gap_matrix(asset: Asset, place: jax.Array, real: jax.Array) -> jax.Array:
-    """Return C, (6B, 6N): velocity and spin of a bond's first node less the second's."""
+    """Return C, (6B, 6N): motion of a bond's first node less the second's."""
     num_nodes, num_bonds = place.shape[0], asset.bond_nodes.shape[0]
     bonds = jnp.arange(num_bonds, dtype=jnp.int32)
     gap = jnp.zeros((num_bonds, 6, num_nodes, 6), place.dtype)

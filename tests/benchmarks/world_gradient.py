@@ -1,4 +1,4 @@
-"""Gradients through impact, friction and fracture: python -m tests.benchmarks.world_gradient.
+"""Gradients of the world step: python -m tests.benchmarks.world_gradient.
 
 A bar of cubes is thrown at the floor, slides, and breaks at given bonds where the blow
 is hard enough. First in float64: reverse against forward mode, and both against finite
@@ -44,7 +44,7 @@ def thrown(dtype, cubes, chunk_contacts, tolerance):
 
 
 def loss(scene, start, impact, push, steps):
-    """Return a mix of where all pieces end, their velocities and healths; and labels."""
+    """Return a mix of all final places, velocities and healths; and what broke."""
     qvel = start.data.qvel.at[:6].add(push[:6])
     health = start.state.bond_health * (1 + push[6])
     moment = start.replace(
