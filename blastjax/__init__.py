@@ -15,6 +15,7 @@ from blastjax import (
     fracture,
     graph,
     serialize,
+    soft,
     spatial,
     stress,
 )
@@ -39,6 +40,7 @@ __all__ = [
     "render",
     "rigid",
     "serialize",
+    "soft",
     "spatial",
     "stress",
     "world",
