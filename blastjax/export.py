@@ -17,7 +17,7 @@ from blastjax import fracture
 from blastjax.author import affine, levels, meshes_of
 from blastjax.author.assembly import Whole, asset_of
 from blastjax.author.mesh import Destructible, Mesh
-from blastjax.core import State
+from blastjax.core import Asset, State
 
 FORMATS = (".glb", ".gltf", ".obj", ".stl")
 
@@ -62,8 +62,8 @@ def save_pieces(
         objects, so each actor gets a file of its own, `<stem>_actor<label>.stl`.
       whole: an asset, with or without meshes.
       state: of it, not batched; None for the unbroken whole.
-      poses: (A, 7) by label, position (m) and quaternion (w first) of the rest frame of
-        each actor; None leaves them in the rest frame.
+      poses: of the elements in a world, what `rigid.bodies.chunk_poses` returns:
+        (A, 3) m and (A, 4), w first; None leaves all in the rest frame.
 
     Returns:
       The files written.
@@ -82,7 +82,7 @@ def save_pieces(
     for label, mesh in pieces(whole, state).items():
         name = f"actor{label}"
         shape = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-        shape.apply_transform(_matrix(place[label]))
+        shape.apply_transform(place[label])
         if kind == ".stl":
             part = target.with_name(f"{target.stem}_{name}.stl")
             part.write_bytes(shape.export(file_type="stl"))
@@ -149,8 +149,9 @@ def save_mjcf(
     owner, chunk = np.asarray(state.actor), np.asarray(asset.element_chunk)
     for label in np.flatnonzero(np.asarray(query.active(asset, state))).tolist():
         body = ET.SubElement(world, "body", name=f"actor{label}")
-        body.set("pos", _text(place[label, :3]))
-        body.set("quat", _text(place[label, 3:]))
+        body.set("pos", _text(place[label, :3, 3]))
+        # Two of its axes say all of a rotation.
+        body.set("xyaxes", _text(place[label, :3, :2].T.reshape(-1)))
         if not held[label]:
             ET.SubElement(body, "freejoint", name=f"actor{label}")
         _inertial(body, moments, label)
@@ -207,20 +208,22 @@ def _state(whole: Whole, state: State | None) -> State:
     return fracture.init(asset_of(whole)) if state is None else state
 
 
-def _poses(asset: Any, poses: Any) -> np.ndarray:
+def _poses(asset: Asset, poses: Any) -> np.ndarray:
+    """Return the pose of each actor's rest frame by label, (A, 4, 4)."""
     number = len(asset.element_chunk)
     if poses is None:
-        return np.tile([0.0, 0, 0, 1, 0, 0, 0], (number, 1))
-    found = np.asarray(poses, float)
-    if found.shape != (number, 7):
+        return np.tile(np.eye(4), (number, 1, 1))
+    position, turn = (np.asarray(x, float) for x in poses)
+    if position.shape != (number, 3) or turn.shape != (number, 4):
         raise ValueError(
-            f"poses have shape {found.shape}; give ({number}, 7), one for each label"
+            f"poses have shapes {position.shape} and {turn.shape}; give ({number}, 3) "
+            f"and ({number}, 4), one for each element"
         )
-    return found
-
-
-def _matrix(pose: np.ndarray) -> np.ndarray:
-    return affine.placed(pose[:3], pose[3:])
+    # An actor bears the name of one of its elements, and moves as that does.
+    rest = np.asarray(query.element_values(asset, asset.chunk_centroid), float)
+    frames = np.stack([affine.placed(quaternion=q) for q in turn])
+    frames[:, :3, 3] = position - np.einsum("aij,aj->ai", frames[:, :3, :3], rest)
+    return frames
 
 
 def _trimesh() -> Any:

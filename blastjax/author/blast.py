@@ -35,7 +35,7 @@ INVALID = 2**32 - 1
 SUPPORT = 1
 """The flag of a support chunk."""
 
-_SPELLINGS: dict[Any, Any] = {"parentChunkDescIndex": "parent"}
+_SPELLINGS = {"parentChunkDescIndex": "parent"}
 _CHUNK = ("parent", "centroid", "volume", "flags")
 _BOND = ("chunkIndices", "normal", "area", "centroid")
 
@@ -130,7 +130,7 @@ def _columns(
 ) -> dict[str, Any]:
     """Return each field's values, None for an optional one that no row has."""
     if isinstance(rows, Mapping):
-        names = {_SPELLINGS.get(k, k): v for k, v in rows.items()}
+        names = _named(rows)
         _refuse_fields(f"the {kind}s", set(names), fields, optional)
         return {f: _listed(names[f]) if f in names else None for f in fields}
     if not isinstance(rows, (list, tuple)):
@@ -141,7 +141,7 @@ def _columns(
             raise ValueError(f"{kind} {i} is {row!r}; it must be an object")
         inner = row.get("bond", {})
         row = {**{k: v for k, v in row.items() if k != "bond"}, **inner}
-        names = {_SPELLINGS.get(k, k): v for k, v in row.items()}
+        names = _named(row)
         _refuse_fields(f"{kind} {i}", set(names), fields, optional)
         for f in fields:
             if f in names:
@@ -152,6 +152,10 @@ def _columns(
         elif len(table[f]) != len(rows):
             raise ValueError(f"some {kind}s have {f!r} and some not; give all or none")
     return table
+
+
+def _named(row: Mapping[str, Any]) -> dict[str, Any]:
+    return {str(_SPELLINGS.get(name, name)): value for name, value in row.items()}
 
 
 def _listed(column: Any) -> list[Any]:

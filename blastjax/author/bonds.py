@@ -81,7 +81,9 @@ def between(
     area, centroid = np.zeros(len(one)), np.zeros((len(one), 3))
     for start in range(0, len(one), _AT_A_TIME):
         some = slice(start, start + _AT_A_TIME)
-        area[some], centroid[some] = clip.shared(one[some], other[some], normal[some])
+        area[some], centroid[some] = clip.shared(
+            one[some], other[some], normal[some], gap
+        )
     return _summed(pairs, owner.astype(int), area, centroid, normal, least)
 
 
