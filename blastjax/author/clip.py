@@ -6,6 +6,9 @@ last, which adds no area. Clipping keeps what lies on one side of a plane.
 
 import numpy as np
 
+ROUNDING = 1e-9
+"""Height over a plane, relative to the greatest of a polygon's, that counts as none."""
+
 
 def by_plane(polygon: np.ndarray, height: np.ndarray) -> np.ndarray:
     """Return the part of each polygon where the height is not above zero.
@@ -19,11 +22,13 @@ def by_plane(polygon: np.ndarray, height: np.ndarray) -> np.ndarray:
       nothing is left, all corners are one point.
     """
     count, corners, _ = polygon.shape
-    inside = height <= 0
+    # Corners on the plane to within rounding are inside: if some of them were not, an
+    # edge along the plane could cross it more than once.
+    inside = height <= ROUNDING * np.abs(height).max(axis=1, keepdims=True)
     following, beyond = np.roll(polygon, -1, axis=1), np.roll(height, -1, axis=1)
-    crosses = inside != (beyond <= 0)
+    crosses = inside != np.roll(inside, -1, axis=1)
     rise = np.where(crosses, beyond - height, 1.0)
-    share = np.where(crosses, -height / rise, 0.0)[..., None]
+    share = np.where(crosses, np.clip(-height / rise, 0, 1), 0.0)[..., None]
     crossing = polygon + share * (following - polygon)
     points = np.stack([polygon, crossing], axis=2).reshape(count, 2 * corners, -1)
     real = np.stack([inside, crosses], axis=2).reshape(count, 2 * corners)
