@@ -7,7 +7,7 @@ how strong it is. `pad` and `stack` bring different assets to one capacity, so t
 share a batch.
 """
 
-from blastjax.author import bonds, materials, shapes, solids
+from blastjax.author import blast, bonds, materials, shapes, solids
 from blastjax.author.affine import mirrored, placed
 from blastjax.author.assembly import (
     Result,
@@ -33,6 +33,7 @@ __all__ = [
     "Mesh",
     "Result",
     "add_bonds",
+    "blast",
     "bonds",
     "build",
     "capacity",
