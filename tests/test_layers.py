@@ -27,6 +27,7 @@ FLOOR = {
     "world": 11,
     "envs": 13,
     "render": 12,
+    "pictures": 12,
     "wrappers": 14,
     "commands": 15,
     "__main__": 16,

@@ -2,9 +2,9 @@
 
 `build` checks and orders descriptions of chunks and bonds. `shapes` has ready-made
 ones, `cut` breaks any closed mesh into chunks, `solids` makes chunks of meshes, `bonds`
-finds what holds meshes together. `merge`, `transform`, `add_bonds`, `unite` and `delete` work on what is there. `materials` says
-how strong it is. `pad` and `stack` bring different assets to one capacity, so that they
-share a batch.
+finds what holds meshes together. `merge`, `transform`, `add_bonds`, `unite` and
+`delete` work on what is there. `materials` says how strong it is. `pad` and `stack`
+bring different assets to one capacity, so that they share a batch.
 """
 
 from blastjax.author import bonds, cut, materials, shapes, solids

@@ -190,7 +190,9 @@ class Breach(Env):
         self._half_height = np.asarray(asset.chunk_size, np.float32)[brick, 2]
         self._fixed_target = self._given_target()
         bonds = np.asarray(asset.bond_nodes)
-        self._bonds = np.bincount(bonds.ravel(), minlength=len(asset.span_node))
+        count = np.bincount(bonds.ravel(), minlength=len(asset.span_node))
+        # A piece that touches nothing has no bonds.
+        self._bonds = np.maximum(count, 1)
 
     @property
     def bricks(self) -> int:
