@@ -7,6 +7,7 @@ pairs of chunks) is not in the program.
 """
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -16,7 +17,7 @@ from mujoco import mjx
 from blastjax import chunks, fracture, graph, pytree, spatial
 from blastjax.core import NONE, Damage, FractureEvents, SplitEvents, State
 from blastjax.damage import falloff
-from blastjax.rigid import bodies, contact, engine, solver
+from blastjax.rigid import bodies, contact, engine, rows, solver
 from blastjax.rigid.scene import Scene
 from blastjax.stress.equilibrium import Structure
 from blastjax.stress.failure import Verdict, judge, stress_damage
@@ -219,10 +220,9 @@ def step(
     data = bodies.place(scene, riding, data)
     data = bodies.kinematics(scene, model, riding, data)
     data, found = contact.collide(scene, riding, model, data)
-    data = engine.constraint_rows(model, data, found.riders.body)
     data = engine.position_sensors(model, data)
     data = engine.smooth_acceleration(model, data, bodies.empty_dofs(scene, riding))
-    data, report = contact.resolve(model, data, scene.line_search)
+    data, report = rows.resolve(scene, model, data, riding, frames, found.riders)
     data = engine.integrate(model, data)
     force = contact.normal_force(data)
 
@@ -259,6 +259,63 @@ def step(
         damage=damage, fracture=broken, split=parted, removed=removed
     )
     return world, events
+
+
+def rollout(
+    scene: Scene,
+    world: World,
+    length: int,
+    *,
+    ctrl: jax.Array | None = None,
+    record: Callable[[World, Events], Any] | None = None,
+    segment: int | None = None,
+    **options: Any,
+) -> tuple[World, Any]:
+    """Advance by many steps, in little memory when differentiated in reverse.
+
+    Args:
+      scene: the scene.
+      world: the world.
+      length: number of steps.
+      ctrl: (length, nu) controls of each step; by default those in the data.
+      record: what to keep of each step, of the world after it and its events.
+      segment: steps between the worlds that reverse mode keeps; by default about the
+        root of the length. Steps are computed up to three times, but only
+        length / segment + segment worlds, and the inside of one step, are in memory.
+      **options: of `step`, the same for all steps.
+
+    Returns:
+      The world at its end, and the records, stacked (length, ...); None without.
+      Derivatives are those of `step`, forward and reverse.
+
+    Raises:
+      ValueError: `length` or `segment` is below 1.
+    """
+    segment = max(1, round(length**0.5)) if segment is None else segment
+    for name, count in (("length", length), ("segment", segment)):
+        if count < 1:
+            raise ValueError(f"{name} is {count}; give 1 or more")
+
+    def one(world: World, ctrl: jax.Array | None) -> tuple[World, Any]:
+        world, events = step(scene, world, ctrl=ctrl, **options)
+        return world, None if record is None else record(world, events)
+
+    def some(world: World, ctrl: jax.Array | None, count: int) -> tuple[World, Any]:
+        return jax.lax.scan(jax.checkpoint(one), world, ctrl, length=count)
+
+    def whole(world: World, ctrl: jax.Array | None) -> tuple[World, Any]:
+        return some(world, ctrl, segment)
+
+    count, rest = divmod(length, segment)
+    split = count * segment
+    parts = jax.tree.map(lambda x: x[:split].reshape(count, segment, -1), ctrl)
+    world, kept = jax.lax.scan(jax.checkpoint(whole), world, parts, length=count)
+    kept = jax.tree.map(lambda x: x.reshape(split, *x.shape[2:]), kept)
+    if rest:
+        tail = jax.tree.map(lambda x: x[split:], ctrl)
+        world, last = some(world, tail, rest)
+        kept = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), kept, last)
+    return world, kept
 
 
 def impact_damage(

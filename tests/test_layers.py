@@ -22,6 +22,7 @@ FLOOR = {
     "fracture": 4,
     "serialize": 4,
     "stress": 5,
+    "soft": 5,
     "rigid": 10,
     "world": 11,
     "envs": 13,

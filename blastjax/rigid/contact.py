@@ -24,7 +24,7 @@ from mujoco import mjx
 
 from blastjax import graph, pytree
 from blastjax.core import NONE
-from blastjax.rigid import engine, hull, solver
+from blastjax.rigid import engine, hull
 from blastjax.rigid.bodies import Bodies
 from blastjax.rigid.scene import Scene
 
@@ -187,42 +187,6 @@ def _fill(
     off = contacts.includemargin + _OFF
     distance = jnp.where(meets, distance, off)
     return contacts.replace(dist=distance, pos=position, frame=frame)
-
-
-def resolve(
-    model: mjx.Model, data: mjx.Data, search_steps: int
-) -> tuple[mjx.Data, solver.Report]:
-    """Solve for the acceleration and the constraint forces."""
-    impl = data._impl
-    if impl.efc_J.shape[0] == 0:
-        free = data.replace(qacc=data.qacc_smooth)
-        nothing = jnp.zeros((), data.qacc.dtype)
-        return free, solver.Report(nothing, jnp.zeros((), jnp.int32))
-    lower, upper = engine.row_bounds(data)
-    problem = solver.Problem(
-        inertia=engine.mass_matrix(model, data),
-        free=data.qacc_smooth,
-        jacobian=impl.efc_J,
-        stiffness=impl.efc_D,
-        reference=impl.efc_aref,
-        lower=lower,
-        upper=upper,
-    )
-    acceleration, force, report = solver.solve(
-        problem,
-        data.qacc_warmstart,
-        model.opt.tolerance,
-        iterations=model.opt.iterations,
-        search_steps=search_steps,
-    )
-    data = data.tree_replace(
-        {
-            "qacc": acceleration,
-            "qfrc_constraint": impl.efc_J.T @ force,
-            "_impl.efc_force": force,
-        }
-    )
-    return data, report
 
 
 def normal_force(data: mjx.Data) -> jax.Array:

@@ -7,6 +7,7 @@ Every function maps (model, data) to data, as MJX's do.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 
 import jax
@@ -24,9 +25,14 @@ from mujoco.mjx._src import (
 )
 from mujoco.mjx._src import math as mjx_math
 
+from blastjax.rigid import solver
+
 Points = tuple[jax.Array, jax.Array, jax.Array]
 """Distance (n,) m, position (n, 3) m and frame (n, 3, 3) of contacts."""
 
+LEAST = mujoco.mjMINVAL
+"""Least softness of a constraint."""
+_ROWS = ("D", "aref", "pos", "margin", "frictionloss")
 _UPPER = ((0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2))
 
 
@@ -127,11 +133,60 @@ def contact_frame(normal: jax.Array) -> jax.Array:
     return mjx_math.make_frame(normal)
 
 
-def constraint_rows(model: mjx.Model, data: mjx.Data, geom_body: jax.Array) -> mjx.Data:
-    """Write the constraint rows, with the geoms on the given bodies (G,)."""
-    # `geom_bodyid` is metadata of the model: a traced copy must not cross a jit, vmap
-    # or scan boundary, so it exists for this one call.
-    return constraint.make_constraint(model.replace(geom_bodyid=geom_body), data)
+def contacts_by_size(data: mjx.Data) -> list[tuple[int, mjx.Contact]]:
+    """Return (dimension, contacts) for each dimension of contacts that there is."""
+    contacts = data._impl.contact
+    found = []
+    for size in sorted(set(contacts.dim.tolist())):
+        rows = np.flatnonzero(contacts.dim == size)
+        part = slice(rows[0], rows[-1] + 1)
+        found.append((size, jax.tree.map(lambda x, part=part: x[part], contacts)))
+    return found
+
+
+def impedance(
+    model: mjx.Model, reference: jax.Array, impedance: jax.Array, depth: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Return spring, damping and impedance of contacts: (n,) of solref and solimp."""
+    return jax.vmap(functools.partial(constraint._kbi, model))(
+        reference, impedance, depth
+    )
+
+
+def point_jacobian(
+    model: mjx.Model, data: mjx.Data, point: jax.Array, body: jax.Array, count: int
+) -> tuple[jax.Array, jax.Array]:
+    """Return how points (n, 3) on bodies (n,) move and turn, each (n, count, 3).
+
+    By the first `count` degrees of freedom.
+    """
+    linear, angular = jax.vmap(functools.partial(support.jac, model, data))(point, body)
+    return linear[:, :count], angular[:, :count]
+
+
+def user_rows(model: mjx.Model, data: mjx.Data, count: int) -> solver.Rows | None:
+    """Return the constraints that are no contacts, on the first `count` joints.
+
+    Equality rows pull and push, dry friction is bounded, limits only push; a force is
+    counted as minus the derivative of the cost, so pushing is the lower side.
+    """
+    impl = data._impl
+    equality, dry = impl.ne, impl.nf
+    if equality + dry + impl.nl == 0:
+        return None
+    alone = data.tree_replace({"_impl.contact.dim": np.zeros(0, int)})
+    made = constraint.make_constraint(model, alone)._impl
+    friction = made.efc_frictionloss
+    row = np.arange(friction.shape[0])
+    pulls, rubs = row < equality, (row >= equality) & (row < equality + dry)
+    endless = jnp.full_like(friction, jnp.inf)
+    return solver.Rows(
+        jacobian=made.efc_J[:, :count],
+        stiffness=made.efc_D,
+        reference=made.efc_aref,
+        lower=jnp.where(rubs, -friction, -endless),
+        upper=jnp.where(pulls, endless, jnp.where(rubs, friction, 0.0)),
+    )
 
 
 def smooth_acceleration(
@@ -152,6 +207,7 @@ def without_matrices(data: mjx.Data) -> mjx.Data:
     return data.tree_replace(
         {
             "_impl.efc_J": jnp.zeros((0, data.qvel.shape[0]), impl.efc_J.dtype),
+            **{f"_impl.efc_{name}": jnp.zeros(0, data.qvel.dtype) for name in _ROWS},
             "_impl.M": jnp.zeros((0,) * impl.M.ndim, impl.M.dtype),
             "_impl.qLD": jnp.zeros((0,) * impl.qLD.ndim, impl.qLD.dtype),
         }
@@ -166,23 +222,6 @@ def position_sensors(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 def mass_matrix(model: mjx.Model, data: mjx.Data) -> jax.Array:
     """Return the joint-space inertia matrix, (V, V)."""
     return support.full_m(model, data)
-
-
-def row_bounds(data: mjx.Data) -> tuple[jax.Array, jax.Array]:
-    """Return the least and the greatest force of each constraint row, both (R,).
-
-    Equality rows pull and push, dry friction is bounded, the others only push; a force
-    is counted as minus the derivative of the cost, so pushing is the lower side.
-    """
-    impl = data._impl
-    count = impl.efc_J.shape[0]
-    friction = impl.efc_frictionloss
-    row = np.arange(count)
-    equality, dry = row < impl.ne, (row >= impl.ne) & (row < impl.ne + impl.nf)
-    endless = jnp.full_like(friction, jnp.inf)
-    lower = jnp.where(dry, -friction, -endless)
-    upper = jnp.where(equality, endless, jnp.where(dry, friction, 0.0))
-    return lower, upper
 
 
 def normal_force(data: mjx.Data) -> jax.Array:

@@ -62,6 +62,8 @@ class Host:
     """Sides of a contact, 0 and 1, on which a chunk can be."""
     chunk_kinds: frozenset[tuple[int, int]]
     """Types of geoms of which two chunks can collide: one pair of types or none."""
+    user_meets: bool
+    """Whether a geom of the user's that moves can collide."""
 
 
 @pytree.dataclass
@@ -89,6 +91,11 @@ class Scene(pytree.Node):
     def slots(self) -> int:
         """K, how many actors can move at a time."""
         return len(self.host.slot_body)
+
+    @property
+    def users(self) -> int:
+        """U, degrees of freedom of the user's model, before those of the slots."""
+        return self.model.nv - 6 * self.slots
 
 
 def build(
@@ -434,6 +441,7 @@ def _host(model: mujoco.MjModel, slots: int, elements: np.ndarray) -> Host:
     body_element[chunk_body] = elements
     geom_element = body_element[model.geom_bodyid]
     pairs = engine.geom_pairs(model)
+    weld = model.body_weldid[model.geom_bodyid]
     return Host(
         model=model,
         slot_body=slot_body,
@@ -442,7 +450,7 @@ def _host(model: mujoco.MjModel, slots: int, elements: np.ndarray) -> Host:
         mocap=model.body_mocapid[chunk_body],
         element=elements,
         geom_element=geom_element,
-        geom_weld=model.body_weldid[model.geom_bodyid],
+        geom_weld=weld,
         chunk_sides=tuple(
             side for side in (0, 1) if (geom_element[pairs[:, side]] >= 0).any()
         ),
@@ -450,4 +458,5 @@ def _host(model: mujoco.MjModel, slots: int, elements: np.ndarray) -> Host:
             (int(model.geom_type[a]), int(model.geom_type[b]))
             for a, b in pairs[(geom_element[pairs] >= 0).all(axis=1)]
         ),
+        user_meets=bool(((geom_element[pairs] < 0) & (weld[pairs] > 0)).any()),
     )
