@@ -83,6 +83,16 @@ def test_meshes_come_back(tmp_path):
     np.testing.assert_array_equal(found.meshes[1].interior, inner.interior)
 
 
+def test_a_shape_with_meshes_and_levels_comes_back(tmp_path):
+    arch = author.unite(author.shapes.arch(voussoirs=6), 3).whole
+    path = serialize.save(tmp_path / "a.npz", arch)
+    found = serialize.load(path).destructible
+    assert same(found.asset, arch.asset)
+    for mesh, old in zip(found.meshes, arch.meshes, strict=True):
+        np.testing.assert_array_equal(mesh.vertices, old.vertices)
+        np.testing.assert_array_equal(mesh.faces, old.faces)
+
+
 def test_damaged_files_are_refused_or_load_the_same(tmp_path):
     asset = hierarchy()
     state = broken(asset)
