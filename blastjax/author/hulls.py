@@ -13,6 +13,7 @@ corners of a face, E edges.
 
 import dataclasses
 import importlib
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -163,11 +164,7 @@ def unpad(hulls: Hulls, row: int) -> Mesh:
     seen: dict[tuple[int, ...], None] = {}
     for loop, size in zip(hulls.corners[row], hulls.size[row], strict=True):
         seen.setdefault(tuple(int(i) for i in loop[:size]))
-    faces = [
-        (loop[0], b, c)
-        for loop in seen
-        for b, c in zip(loop[1:-1], loop[2:], strict=True)
-    ]
+    faces = [(loop[0], b, c) for loop in seen for b, c in itertools.pairwise(loop[1:])]
     used, flat = np.unique(np.array(faces, np.int32), return_inverse=True)
     return Mesh(hulls.vertices[row][used], flat.reshape(-1, 3).astype(np.int32))
 

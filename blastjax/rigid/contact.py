@@ -148,7 +148,8 @@ def _colliders(scene: Scene, group: engine.Group) -> list[tuple[np.ndarray, Coll
     chunk = scene.host.geom_element[group.pair] >= 0
     table = None if scene.hulls is None else hull.colliders(scene.hulls)
     parts: dict[Collider, list] = {}
-    for sides in itertools.product((False, True), repeat=2):
+    for first, second in itertools.product((False, True), repeat=2):
+        sides = first, second
         rows = np.flatnonzero((chunk == sides).all(axis=1))
         if rows.size:
             how = _collider(group, sides, table)

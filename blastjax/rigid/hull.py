@@ -122,7 +122,7 @@ def sphere_hull(
 def capsule_hull(
     table: Table, model: mjx.Model, data: mjx.Data, pair: jax.Array
 ) -> engine.Points:
-    """Collide capsules with hulls: as balls at both ends and where they come closest."""
+    """Collide capsules with hulls: as balls at both ends and where it is closest."""
 
     def one(capsule: jax.Array, geom: jax.Array) -> engine.Points:
         half = data.geom_xmat[capsule][:, 2] * model.geom_size[capsule, 1]
@@ -131,15 +131,20 @@ def capsule_hull(
             jnp.stack([center - half, center + half])
         )
         solid = _solid(table, geom)
-        between = _closest_on_segment(jax.lax.stop_gradient((solid, ends)))
-        along = ends[0] + between * (ends[1] - ends[0])
-        balls = jnp.concatenate([ends, along[None]])
+        between = _closest_on_segment(*jax.lax.stop_gradient((solid, ends)))
+        along = ends[0] + between[:, None] * (ends[1] - ends[0])
+        balls = jnp.concatenate([ends, along])
         radius = model.geom_size[capsule, 0]
-        found = jax.vmap(lambda at: _ball(solid, at, radius, data, geom))(balls)
+        distance, point, frame = jax.vmap(
+            lambda at: _ball(solid, at, radius, data, geom)
+        )(balls)
         # At an end it would be the same contact twice.
         inner = (between > 1e-3) & (between < 1 - 1e-3)
-        distance = found[0].at[2].set(jnp.where(inner, found[0][2], _FAR))
-        return distance, found[1], found[2]
+        distance = distance.at[2:].set(jnp.where(inner, distance[2:], _FAR))
+        third = 2 + jnp.argmin(jax.lax.stop_gradient(distance[2:]))
+        kept = jnp.stack([jnp.zeros_like(third), jnp.ones_like(third), third])
+        distance, point, frame = (x[kept] for x in (distance, point, frame))
+        return distance, point, frame
 
     return _flat(jax.vmap(one)(pair[:, 0], pair[:, 1]))
 
@@ -299,7 +304,7 @@ def _extreme(a: _Solid, b: _Solid, normal: jax.Array, swap: jax.Array) -> jax.Ar
 def _ring(face: Face) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Return start and end of a face's edges (P, 3), and which there are (P,)."""
     corners, _, size = face
-    count = np.arange(corners.shape[0])
+    count = jnp.arange(corners.shape[0])
     following = jnp.where(count + 1 < size, count + 1, 0)
     return corners, corners[following], count < size
 
@@ -447,14 +452,12 @@ def _nearest_on_surface(
     return nearest, outside & jnp.any((over > 0) & real)
 
 
-def _closest_on_segment(what: tuple[_Solid, jax.Array]) -> jax.Array:
-    """Return where, 0 to 1, a segment (2, 3) comes closest to a hull or is deepest.
+def _closest_on_segment(solid: _Solid, ends: jax.Array) -> jax.Array:
+    """Return where, 0 to 1, a segment (2, 3) is closest to faces and to edges, (2,).
 
-    The greatest distance over a hull's faces is convex along the segment, so halving
-    by the sign of its slope finds the least. (Off a corner that distance is below the
-    true one; the contact itself is measured exactly.)
+    The greatest distance over a hull's faces is convex along the segment, so halving by
+    the sign of its slope finds the least: the closest point to a face, and the deepest.
     """
-    solid, ends = what
     gap = ends @ solid.normal.T - solid.offset
     rise = gap[1] - gap[0]
 
@@ -465,5 +468,20 @@ def _closest_on_segment(what: tuple[_Solid, jax.Array]) -> jax.Array:
         return jnp.where(falls, middle, low), jnp.where(falls, high, middle)
 
     zero = jnp.zeros((), gap.dtype)
-    low, high = jax.lax.fori_loop(0, 20, halve, (zero, zero + 1.0))
-    return 0.5 * (low + high)
+    low, high = jax.lax.fori_loop(0, 30, halve, (zero, zero + 1.0))
+
+    start, finish = (solid.vertices[solid.edges[:, k]] for k in range(2))
+    edge, line, offset = finish - start, ends[1] - ends[0], ends[0] - start
+    lines, edges, both = line @ line, jnp.sum(edge * edge, axis=1), edge @ line
+    on_line, on_edge = offset @ line, jnp.sum(offset * edge, axis=1)
+    square = lines * edges - both * both
+    safe = square > 1e-9 * lines * edges
+    t = (both * on_edge - edges * on_line) / jnp.where(safe, square, 1.0)
+    t = jnp.clip(jnp.where(safe, t, 0.5), 0.0, 1.0)
+    s = (both * t + on_edge) / jnp.where(edges > 0, edges, 1.0)
+    s = jnp.clip(s, 0.0, 1.0)
+    t = (both * s - on_line) / jnp.where(lines > 0, lines, 1.0)
+    t = jnp.clip(t, 0.0, 1.0)
+    apart = offset + t[:, None] * line - s[:, None] * edge
+    nearest = jnp.argmin(jnp.sum(apart * apart, axis=1))
+    return jnp.stack([0.5 * (low + high), t[nearest]])

@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Sequence
 
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 
@@ -56,7 +57,7 @@ def of_geoms(
         for name in (f.name for f in dataclasses.fields(Table))
         if name != "row"
     }
-    return Table(**fields, row=row), reach
+    return Table(**fields, row=jnp.asarray(row)), reach
 
 
 def solids(
@@ -74,7 +75,8 @@ def solids(
     found = {}
     for element in elements:
         c = int(chunk[element])
-        rows = [] if hulls is None else np.flatnonzero(hulls.chunk == c)
+        own = np.zeros(0, int) if hulls is None else hulls.chunk
+        rows = np.flatnonzero(own == c)
         if meshes is not None and len(rows) < 2:
             mesh = meshes[c]
             moved = dataclasses.replace(mesh, vertices=mesh.vertices - center[c])
