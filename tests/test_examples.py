@@ -4,6 +4,7 @@ import importlib.util
 import pathlib
 
 import numpy as np
+import pytest
 
 from tests.test_envs import SMALL
 
@@ -46,3 +47,10 @@ def test_size_a_beam(capsys):
     after = load("size_a_beam").main(length=4, steps=40)
     np.testing.assert_allclose(after, 2.0, rtol=0.01)
     assert "safety before" in capsys.readouterr().out
+
+
+def test_build_a_gate(capsys, tmp_path):
+    trimesh = pytest.importorskip("trimesh")
+    count = load("build_a_gate").main(tmp_path / "gate.glb")
+    assert "1000 kg: held" in capsys.readouterr().out
+    assert len(trimesh.load_scene(tmp_path / "gate.glb").geometry) == count > 1
