@@ -19,6 +19,7 @@ FLOOR = {
     "chunks": 2,
     "consistency": 3,
     "damage": 3,
+    "export": 5,
     "fracture": 4,
     "serialize": 4,
     "stress": 5,

@@ -7,7 +7,7 @@ finds what holds meshes together. `merge`, `transform`, `add_bonds`, `unite` and
 bring different assets to one capacity, so that they share a batch.
 """
 
-from blastjax.author import bonds, cut, materials, shapes, solids
+from blastjax.author import blast, bonds, cut, materials, shapes, solids
 from blastjax.author.affine import mirrored, placed
 from blastjax.author.assembly import (
     Result,
@@ -33,6 +33,7 @@ __all__ = [
     "Mesh",
     "Result",
     "add_bonds",
+    "blast",
     "bonds",
     "build",
     "capacity",

@@ -24,7 +24,7 @@ from mujoco import mjx
 
 from blastjax import graph, pytree
 from blastjax.core import NONE
-from blastjax.rigid import engine
+from blastjax.rigid import engine, hull
 from blastjax.rigid.bodies import Bodies
 from blastjax.rigid.scene import Scene
 
@@ -146,21 +146,30 @@ def collide(
 def _colliders(scene: Scene, group: engine.Group) -> list[tuple[np.ndarray, Collider]]:
     """Return which rows of a group collide by what."""
     chunk = scene.host.geom_element[group.pair] >= 0
+    table = None if scene.hulls is None else hull.colliders(scene.hulls)
     parts: dict[Collider, list] = {}
     for first, second in itertools.product((False, True), repeat=2):
-        rows = np.flatnonzero((chunk == (first, second)).all(axis=1))
+        sides = first, second
+        rows = np.flatnonzero((chunk == sides).all(axis=1))
         if rows.size:
-            how = _collider(scene, group, (first, second))
+            how = _collider(group, sides, table)
             parts.setdefault(how, []).append(rows)
     return [(np.sort(np.concatenate(rows)), how) for how, rows in parts.items()]
 
 
-def _collider(scene: Scene, group: engine.Group, sides: tuple[bool, bool]) -> Collider:
+def _collider(
+    group: engine.Group,
+    sides: tuple[bool, bool],
+    table: dict[int, tuple[hull.Find, int]] | None,
+) -> Collider:
     """Return how pairs of a group collide whose first or second geom is a chunk.
 
     A shape that MJX does not know is one more function (model, data, pairs) here.
     """
-    del scene, sides
+    if table is not None and any(sides):
+        # A hull is a box to MJX; the other geom's type says how they meet.
+        other = group.types[1] if sides[0] else group.types[0]
+        return Collider(*table[other])
     if group.types == (_PLANE, _BOX):
         return Collider(_plane_box, 4)
     return Collider(group.find, group.count)
