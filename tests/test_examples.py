@@ -43,6 +43,13 @@ def test_which_brick(capsys, tmp_path):
     assert (tmp_path / "table.png").stat().st_size > 5000
 
 
+def test_break_a_vase(capsys, tmp_path):
+    actors = load("break_a_vase").main(tmp_path)
+    assert actors > 3
+    assert "48 shards" in capsys.readouterr().out
+    assert len(list(tmp_path.glob("vase*.png"))) == 3
+
+
 def test_size_a_beam(capsys):
     after = load("size_a_beam").main(length=4, steps=40)
     np.testing.assert_allclose(after, 2.0, rtol=0.01)
