@@ -128,8 +128,6 @@ def _pyramids(
     # Rows are the normal, then the axes of friction times their coefficients.
     scale = jnp.concatenate([active[None], active * friction])
     axes = contacts.frame.transpose(1, 2, 0)
-    velocity = motion(scene, data.qvel)
-    moving = jnp.zeros_like(scale)
 
     sides = []
     for side in scene.host.chunk_sides:
@@ -142,10 +140,9 @@ def _pyramids(
     if scene.host.user_meets:
         user = _user_jacobian(scene, model, data, contacts, size) * scale[..., None]
 
-    found = solver.Contacts(
-        sides=tuple(sides), user=user, stiffness=depth, reference=moving
-    )
-    moving = solver.contact_motion(found, velocity)
+    unset = jnp.zeros_like(depth), jnp.zeros_like(scale)
+    found = solver.Contacts(tuple(sides), user, *unset)
+    moving = solver.contact_motion(found, motion(scene, data.qvel))
     spring, damping, impedance = engine.impedance(
         model, contacts.solref, contacts.solimp, depth
     )
