@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from blastjax import author, chunks, damage, fracture, graph, spatial
+from blastjax import author, chunks, damage, fracture, graph, soft, spatial
 from blastjax.core import Asset, Damage, State
 
 pytestmark = pytest.mark.usefixtures("strict")
@@ -119,6 +119,12 @@ TABLE = {
     "fracture.step": lambda a, s, x: fracture.step(
         a, s, jax.tree.map(lambda y: x * y, worn_amounts(a, s))
     ),
+    "graph.bottleneck": lambda a, s, x: graph.bottleneck(
+        a.bond_nodes,
+        jnp.where(s.bond_intact, x * s.bond_health - 0.3, -jnp.inf),
+        chunks.is_chunk(a)[: a.span_node.shape[0]] & (a.span_node == 3),
+        a.span_node.shape[0],
+    )[0],
     "graph.group_any": lambda a, s, x: graph.group_any(
         s.bond_intact, a.bond_nodes[:, 0], a.span_node.shape[0]
     ),
