@@ -108,7 +108,9 @@ def draw(truth: np.ndarray, fit: np.ndarray, picture) -> None:
     grid = np.round(np.asarray(WALL.chunk_centroid), 3)
     extent = (grid[:, 0].min() - 0.5, grid[:, 0].max() + 0.5, 0, SIDE)
     order = np.lexsort((grid[:, 0], grid[:, 2]))
-    for panel, values, name in zip(panels, (truth, fit), ("true", "found"), strict=False):
+    for panel, values, name in zip(
+        panels, (truth, fit), ("true", "found"), strict=False
+    ):
         image = np.exp(values)[order].reshape(SIDE, SIDE)
         shown = panel.imshow(image, origin="lower", extent=extent, vmin=0.4, vmax=2.2)
         panel.set(title=f"{name} strength", xlabel="x, m", ylabel="z, m")

@@ -67,8 +67,9 @@ def weibull(shape: float | jax.Array = 5.0) -> Strength:
     def log_odds(health: jax.Array, damage: jax.Array) -> jax.Array:
         power = jnp.asarray(shape, health.dtype)
         hit = (damage > 0) & (health > 0)
-        ratio = jnp.where(hit, damage, 1) / jnp.where(hit, health, 1)
-        scaled = jnp.log(ratio) + jax.scipy.special.gammaln(1 + 1 / power)
+        # No quotient: of a huge health it would be zero, and its logarithm infinite.
+        scaled = jnp.log(jnp.where(hit, damage, 1)) - jnp.log(jnp.where(hit, health, 1))
+        scaled = scaled + jax.scipy.special.gammaln(1 + 1 / power)
         # Beyond these the outcome is certain to more digits than any float has.
         log_hazard = jnp.clip(power * scaled, -60.0, 4.0)
         hazard = jnp.exp(jnp.maximum(log_hazard, -10.0))
