@@ -385,3 +385,13 @@ def test_gradients_are_finite(name, sample):
             if slope.dtype != jax.dtypes.float0:
                 where = f"{case}: {jax.tree_util.keystr(path)}"
                 assert np.isfinite(slope).all(), where
+
+
+WORDS = ("deriv", "ifferentiab", "iecewise constant", "onstant under", "nteger")
+
+
+@pytest.mark.parametrize("name", TABLE)
+def test_docstrings_speak_of_derivatives(name):
+    room, function = name.split(".")
+    text = getattr(next(m for m in MODULES if m.__name__.endswith(room)), function)
+    assert any(word in text.__doc__ for word in WORDS), name

@@ -335,9 +335,7 @@ def main():
         print(f"wall {case.name}: reference of {batches * size} samples")
         for name, value in check.items():
             print(f"  bond flip against it, {name}: {value:.4f}")
-        print(
-            f"  leave-one-out error is a / sqrt(runs), a over blows (quartiles): {blows}"
-        )
+        print(f"  leave-one-out error a / sqrt(runs), quartiles of a: {blows}")
         checks[case.name]["a over blows"] = blows
         print(f"  {'estimator':20s}   runs   rmse   bias (noise)   dev  cosine      ms")
         found = assess(case, truth, options.repeats, options.seed, sizes)
