@@ -48,6 +48,7 @@ def logistic(temperature: float | jax.Array = 0.1) -> Strength:
 
     A bond survives with probability sigmoid((health - damage) / temperature), whether
     it was hit or not. The temperature is the scale of the distribution, health.
+    Log odds are differentiable in health, damage and temperature.
     """
 
     def log_odds(health: jax.Array, damage: jax.Array) -> jax.Array:
@@ -61,7 +62,8 @@ def weibull(shape: float | jax.Array = 5.0) -> Strength:
 
     A bond survives with probability exp(-(damage gamma(1 + 1 / shape) / health)^shape);
     what was not hit survives. A high shape is a reliable material (ceramics 5 to 20).
-    Each event draws anew: that a bond withstood an earlier one is not remembered.
+    Each event draws anew: that a bond withstood an earlier one is not remembered. Log
+    odds are differentiable in health, damage and shape, where there is damage.
     """
 
     def log_odds(health: jax.Array, damage: jax.Array) -> jax.Array:
