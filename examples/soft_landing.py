@@ -1,6 +1,6 @@
 """Throw a fragile bar so that it survives its landing, by gradient through contact.
 
-The bar must come to x = 2.5 m. Its throw (speed along x and z, spin) is improved by
+The bar must come to x = 2 m. Its throw (speed along x and z, spin) is improved by
 the derivative of the health that its bonds lose, through flight, impact and friction.
 `python examples/soft_landing.py landing.png` also draws the throws.
 """
@@ -16,10 +16,10 @@ from blastjax import rigid, world
 from blastjax.author import shapes
 
 BAR = shapes.grid((3, 1, 1), (0.4, 0.2, 0.2))
-HEALTH, GOAL, STEPS = 1.0, 2.5, 160
+HEALTH, GOAL, STEPS = 1.0, 2.0, 150
 TOUGH = 1e6
 """Health of the bar that is thrown to learn: it loses health but does not break."""
-IMPACT = world.Impact(threshold=400.0, hardness=50.0, min_radius=0.2, max_radius=0.8)
+IMPACT = world.Impact(threshold=400.0, hardness=57.0, min_radius=0.2, max_radius=0.8)
 
 
 def build() -> rigid.Scene:
@@ -52,7 +52,7 @@ def throw(scene: rigid.Scene, start: world.World, way: jax.Array) -> tuple:
 
 
 def main(
-    picture: str | os.PathLike[str] | None = None, rounds: int = 60
+    picture: str | os.PathLike[str] | None = None, rounds: int = 80
 ) -> tuple[float, float, int]:
     """Return the worst share of health lost, before and after, and pieces."""
     scene = build()
@@ -84,7 +84,8 @@ def main(
         paths.append(np.asarray(pose))
         mean, square = 0.9 * mean + 0.1 * slope, 0.99 * square + 0.01 * slope**2
         fair = mean / (1 - 0.9**count), square / (1 - 0.99**count)
-        way = way - 0.08 * fair[0] / (jnp.sqrt(fair[1]) + 1e-6)
+        # Smaller and smaller: an impact that moves to another step is a small jump.
+        way = way - 0.15 * 0.96**count * fair[0] / (jnp.sqrt(fair[1]) + 1e-6)
     best = int(np.argmin(values))
 
     fragile = world.init(scene, bond_health=HEALTH)
