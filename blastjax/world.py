@@ -268,7 +268,6 @@ def rollout(
     *,
     ctrl: jax.Array | None = None,
     record: Callable[[World, Events], Any] | None = None,
-    segment: int | None = None,
     **options: Any,
 ) -> tuple[World, Any]:
     """Advance by many steps, in little memory when differentiated in reverse.
@@ -279,43 +278,26 @@ def rollout(
       length: number of steps.
       ctrl: (length, nu) controls of each step; by default those in the data.
       record: what to keep of each step, of the world after it and its events.
-      segment: steps between the worlds that reverse mode keeps; by default about the
-        root of the length. Steps are computed up to three times, but only
-        length / segment + segment worlds, and the inside of one step, are in memory.
       **options: of `step`, the same for all steps.
 
     Returns:
       The world at its end, and the records, stacked (length, ...); None without.
-      Derivatives are those of `step`, forward and reverse.
+      Derivatives are those of `step`, forward and reverse. Reverse mode keeps one
+      world a step, and computes each step a second time to get at its inside.
 
     Raises:
-      ValueError: `length` or `segment` is below 1.
+      ValueError: `length` is below 1.
     """
-    segment = max(1, round(length**0.5)) if segment is None else segment
-    for name, count in (("length", length), ("segment", segment)):
-        if count < 1:
-            raise ValueError(f"{name} is {count}; give 1 or more")
+    if length < 1:
+        raise ValueError(f"length is {length}; give 1 or more")
 
     def one(world: World, ctrl: jax.Array | None) -> tuple[World, Any]:
         world, events = step(scene, world, ctrl=ctrl, **options)
         return world, None if record is None else record(world, events)
 
-    def some(world: World, ctrl: jax.Array | None, count: int) -> tuple[World, Any]:
-        return jax.lax.scan(jax.checkpoint(one), world, ctrl, length=count)
-
-    def whole(world: World, ctrl: jax.Array | None) -> tuple[World, Any]:
-        return some(world, ctrl, segment)
-
-    count, rest = divmod(length, segment)
-    split = count * segment
-    parts = jax.tree.map(lambda x: x[:split].reshape(count, segment, -1), ctrl)
-    world, kept = jax.lax.scan(jax.checkpoint(whole), world, parts, length=count)
-    kept = jax.tree.map(lambda x: x.reshape(split, *x.shape[2:]), kept)
-    if rest:
-        tail = jax.tree.map(lambda x: x[split:], ctrl)
-        world, last = some(world, tail, rest)
-        kept = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), kept, last)
-    return world, kept
+    # Within a scan nothing can be shared with the first time anyway.
+    again = jax.checkpoint(one, prevent_cse=False)
+    return jax.lax.scan(again, world, ctrl, length=length)
 
 
 def impact_damage(

@@ -93,7 +93,7 @@ def test_shared_area_of_triangles_against_sampling():
     one, other = rng.random((2, 40, 3, 3))
     one[..., 2] = other[..., 2] = 0
     up = np.tile([0.0, 0, 1], (40, 1))
-    area, centroid = clip.shared(one, other, up)
+    area, centroid = clip.shared(one, other, up, 0.1)
     grid = (np.stack(np.meshgrid(*[np.arange(400)] * 2), -1).reshape(-1, 2) + 0.5) / 400
 
     def covers(triangle):

@@ -19,6 +19,7 @@ FLOOR = {
     "chunks": 2,
     "consistency": 3,
     "damage": 3,
+    "export": 5,
     "fracture": 4,
     "serialize": 4,
     "stress": 5,
@@ -27,8 +28,10 @@ FLOOR = {
     "world": 11,
     "envs": 13,
     "render": 12,
+    "pictures": 12,
     "wrappers": 14,
-    "__main__": 15,
+    "commands": 15,
+    "__main__": 16,
     "__init__": 20,
 }
 PHYSICS = {"mujoco", "brax", "gymnasium"}

@@ -1,13 +1,13 @@
 """Making assets, on the host: descriptions in, an immutable `Asset` out.
 
 `build` checks and orders descriptions of chunks and bonds. `shapes` has ready-made
-ones, `solids` makes them of meshes, `bonds` finds what holds meshes together. `merge`,
-`transform`, `add_bonds`, `unite` and `delete` work on what is there. `materials` says
-how strong it is. `pad` and `stack` bring different assets to one capacity, so that they
-share a batch.
+ones, `cut` breaks any closed mesh into chunks, `solids` makes chunks of meshes, `bonds`
+finds what holds meshes together. `merge`, `transform`, `add_bonds`, `unite` and
+`delete` work on what is there. `materials` says how strong it is. `pad` and `stack`
+bring different assets to one capacity, so that they share a batch.
 """
 
-from blastjax.author import bonds, materials, shapes, solids
+from blastjax.author import blast, bonds, cut, materials, shapes, solids
 from blastjax.author.affine import mirrored, placed
 from blastjax.author.assembly import (
     Result,
@@ -33,9 +33,11 @@ __all__ = [
     "Mesh",
     "Result",
     "add_bonds",
+    "blast",
     "bonds",
     "build",
     "capacity",
+    "cut",
     "delete",
     "describe",
     "ensure_coverage",

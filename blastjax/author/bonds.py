@@ -20,7 +20,9 @@ from blastjax.author.overlap import box_pairs
 from blastjax.core import WORLD
 
 FACING = np.cos(np.radians(20.0))
-"""Least cosine between one face's normal and the other's reversed."""
+"""Least cosine between one face's normal and the other's reversed, over a gap."""
+FLAT = np.cos(1e-3)
+"""The same for faces that touch."""
 _AT_A_TIME = 200_000
 
 
@@ -28,7 +30,7 @@ def between(
     meshes: Sequence[Mesh],
     *,
     gap: float | None = None,
-    facing: float = FACING,
+    facing: float | None = None,
     min_area: float | None = None,
     parts: Any = None,
 ) -> Bonds:
@@ -38,7 +40,9 @@ def between(
       meshes: one a piece, closed; the bonds name pieces by their place here.
       gap: widest joint that is still bonded, m; as deep may pieces overlap. None takes
         1e-6 of the whole's extent: faces that touch.
-      facing: least cosine of the angle between faces that look at each other.
+      facing: least cosine of the angle between faces that look at each other. None
+        takes FACING; without a gap, FLAT, so that pieces which meet in an edge between
+        slanting faces are not bonded there.
       min_area: bonds with less are left out, m^2; None takes 1e-9 of the squared
         extent of the whole, below which faces touch in an edge or by rounding.
       parts: (n,) int, the part that each piece belongs to: only bonds between different
@@ -57,6 +61,8 @@ def between(
         return Bonds.none()
     low, high = _bounds(corners)
     extent = float((high.max(axis=0) - low.min(axis=0)).max())
+    if facing is None:
+        facing = FLAT if gap is None else FACING
     gap = 1e-6 * extent if gap is None else _not_negative("gap", gap)
     least = 1e-9 * extent**2 if min_area is None else _not_negative("area", min_area)
     pairs = box_pairs(low, high, gap)
@@ -81,7 +87,9 @@ def between(
     area, centroid = np.zeros(len(one)), np.zeros((len(one), 3))
     for start in range(0, len(one), _AT_A_TIME):
         some = slice(start, start + _AT_A_TIME)
-        area[some], centroid[some] = clip.shared(one[some], other[some], normal[some])
+        area[some], centroid[some] = clip.shared(
+            one[some], other[some], normal[some], gap
+        )
     return _summed(pairs, owner.astype(int), area, centroid, normal, least)
 
 

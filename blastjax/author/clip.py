@@ -6,6 +6,9 @@ last, which adds no area. Clipping keeps what lies on one side of a plane.
 
 import numpy as np
 
+ROUNDING = 1e-9
+"""Height over a plane, relative to the greatest of a polygon's, that counts as none."""
+
 
 def by_plane(polygon: np.ndarray, height: np.ndarray) -> np.ndarray:
     """Return the part of each polygon where the height is not above zero.
@@ -19,11 +22,13 @@ def by_plane(polygon: np.ndarray, height: np.ndarray) -> np.ndarray:
       nothing is left, all corners are one point.
     """
     count, corners, _ = polygon.shape
-    inside = height <= 0
+    # Corners on the plane to within rounding are inside: if some of them were not, an
+    # edge along the plane could cross it more than once.
+    inside = height <= ROUNDING * np.abs(height).max(axis=1, keepdims=True)
     following, beyond = np.roll(polygon, -1, axis=1), np.roll(height, -1, axis=1)
-    crosses = inside != (beyond <= 0)
+    crosses = inside != np.roll(inside, -1, axis=1)
     rise = np.where(crosses, beyond - height, 1.0)
-    share = np.where(crosses, -height / rise, 0.0)[..., None]
+    share = np.where(crosses, np.clip(-height / rise, 0, 1), 0.0)[..., None]
     crossing = polygon + share * (following - polygon)
     points = np.stack([polygon, crossing], axis=2).reshape(count, 2 * corners, -1)
     real = np.stack([inside, crosses], axis=2).reshape(count, 2 * corners)
@@ -54,7 +59,7 @@ def vector_area(polygon: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def shared(
-    one: np.ndarray, other: np.ndarray, normal: np.ndarray
+    one: np.ndarray, other: np.ndarray, normal: np.ndarray, gap: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return area (K,) and centroid (K, 3) of what triangles share, seen along normals.
 
@@ -63,6 +68,7 @@ def shared(
       other: (K, 3, 3) corners.
       normal: (K, 3) unit; both triangles are projected along it onto the plane through
         the mean of their middles, where the centroid lies.
+      gap: only where their planes are no farther apart along the normal, m.
     """
     middle = (one.mean(axis=1) + other.mean(axis=1))[:, None] / 2
 
@@ -78,5 +84,18 @@ def shared(
         outward = np.cross(end - start, normal)
         height = np.einsum("kmi,ki->km", polygon - start[:, None], outward)
         polygon = by_plane(polygon, height)
+    for sign in (1, -1):
+        apart = _height(other - middle, polygon, normal) - _height(
+            one - middle, polygon, normal
+        )
+        polygon = by_plane(polygon, sign * apart - gap)
     total, centroid = vector_area(polygon)
     return np.linalg.norm(total, axis=1), centroid + middle[:, 0]
+
+
+def _height(triangle: np.ndarray, point: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Return how far above points (K, M, 3) the triangle's plane is, (K, M)."""
+    own = np.cross(triangle[:, 1] - triangle[:, 0], triangle[:, 2] - triangle[:, 0])
+    rise = np.einsum("ki,ki->k", own, normal)[:, None]
+    arm = np.einsum("kmi,ki->km", triangle[:, :1] - point, own)
+    return arm / np.where(rise == 0, 1.0, rise)

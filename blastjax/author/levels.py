@@ -63,7 +63,7 @@ def unite(whole: Whole, size: int = 8, *, levels: int | None = None) -> Result:
             members = np.flatnonzero(parent == name)
             chunks = together(chunks, _sum(chunks, members))
             if meshes:
-                meshes.append(_joined([meshes[i] for i in members]))
+                meshes.append(join([meshes[i] for i in members]))
         levels = None if levels is None else levels - 1
     result = rebuilt(whole, chunks, bonds, meshes)
     return dataclasses.replace(result, chunk_map=result.chunk_map[:count])
@@ -165,7 +165,7 @@ def _sum(chunks: Chunks, members: np.ndarray) -> Chunks:
     )
 
 
-def _joined(meshes: list[Mesh]) -> Mesh:
+def join(meshes: list[Mesh]) -> Mesh:
     """Return closed meshes as one."""
     starts = np.cumsum([0, *(len(m.vertices) for m in meshes[:-1])])
     known = all(m.interior is not None for m in meshes)
@@ -198,7 +198,7 @@ def _without(
         for name in ("centroid", "volume", "size", "inertia"):
             getattr(chunks, name)[i] = getattr(rest, name)[0]
         if meshes:
-            meshes[i] = _joined([meshes[m] for m in members])
+            meshes[i] = join([meshes[m] for m in members])
     return chunks, meshes, gone
 
 

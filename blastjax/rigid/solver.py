@@ -134,7 +134,8 @@ def contact_motion(contacts: Contacts, motion: Motion) -> jax.Array:
     total = jnp.zeros_like(contacts.reference)
     for slot, jacobian in contacts.sides:
         moving = _dot(motion.slots, _membership(slot, motion.slots))
-        total = total + sum(jacobian[:, j] * moving[j] for j in range(6))
+        for j in range(6):
+            total = total + jacobian[:, j] * moving[j]
     if contacts.user is not None:
         total = total + _dot(contacts.user, motion.user)
     return total
@@ -155,7 +156,10 @@ def apply_transpose(problem: Problem, forces: Forces) -> Motion:
     for contacts, edges in zip(problem.contacts, forces.edges, strict=True):
         axes = _axes(edges)
         for slot, jacobian in contacts.sides:
-            wrench = (jacobian * axes[:, None]).sum(axis=0)
+            # Written out: a sum over a leading axis is slow on the CPU.
+            wrench = jacobian[0] * axes[0]
+            for d in range(1, len(axes)):
+                wrench = wrench + jacobian[d] * axes[d]
             slots = slots + _dot(wrench, _membership(slot, slots).T)
         if contacts.user is not None:
             user = user + jnp.tensordot(
@@ -177,8 +181,10 @@ def _axes(edges: jax.Array) -> jax.Array:
     if edges.shape[0] == 1:
         return edges
     plus, minus = jnp.split(edges, 2)
-    normal = sum(plus[i] + minus[i] for i in range(plus.shape[0]))
-    return jnp.concatenate([normal[None], plus - minus])  # type: ignore[index]
+    normal = plus[:1] + minus[:1]
+    for i in range(1, plus.shape[0]):
+        normal = normal + plus[i : i + 1] + minus[i : i + 1]
+    return jnp.concatenate([normal, plus - minus])
 
 
 def _add(a: Any, b: Any, times: jax.Array | float = 1.0) -> Any:
@@ -186,7 +192,7 @@ def _add(a: Any, b: Any, times: jax.Array | float = 1.0) -> Any:
 
 
 def _total(terms: Any) -> jax.Array:
-    leaves = [jnp.sum(leaf) for leaf in jax.tree.leaves(terms)]
+    leaves = [jnp.sum(leaf) for leaf in jax.tree.leaves(terms) if leaf.size]
     return sum(leaves[1:], leaves[0])
 
 
@@ -255,10 +261,9 @@ def _weigh(edges: jax.Array, parts: list[jax.Array]) -> list[jax.Array]:
         return [edges[0] * parts[0]]
     plus, minus = jnp.split(edges, 2)
     own, cross = plus + minus, plus - minus
-    normal = own.sum(axis=0) * parts[0]
-    found = []
+    normal, found = jnp.zeros_like(parts[0]), []
     for i, part in enumerate(parts[1:]):
-        normal = normal + cross[i] * part
+        normal = normal + own[i] * parts[0] + cross[i] * part
         found.append(cross[i] * parts[0] + own[i] * part)
     return [normal, *found]
 

@@ -6,6 +6,7 @@ takes, and how much of it is the boolean library's.
 """
 
 import argparse
+import itertools
 import json
 import time
 
@@ -77,7 +78,7 @@ def _timed(mesh):
     sites = mark(cut.uniform(solid, 256, seed=0))
     tree = mark(cut.voronoi(solid, sites))
     mark(cut.destructible(tree))
-    parts = [b - a for a, b in zip(marks[:-1], marks[1:], strict=True)]
+    parts = [b - a for a, b in itertools.pairwise(marks)]
     cells = complexes.bodies(complexes.voronoi(sites.points, *solid.bounds()), 0)
     # The library works when a result is asked for, and never twice: a fresh solid.
     whole = geometry.mesh(solid.bodies[0], solid.skin)[0]

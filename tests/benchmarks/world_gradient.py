@@ -145,11 +145,12 @@ def main():
     parser.add_argument("--pieces", action="store_true", help="let pieces collide")
     parser.add_argument("--json")
     options = parser.parse_args()
-    figures = {"float64": check(options), "float32": measure(options)}
-    for name, rows in figures.items():
+    figures = {}
+    for name, run in (("float64", check), ("float32", measure)):
+        figures[name] = run(options)
         print(name)
-        for key, value in rows.items():
-            print(f"  {key:36s} {value}")
+        for key, value in figures[name].items():
+            print(f"  {key:36s} {value}", flush=True)
     if options.json:
         with open(options.json, "w") as file:
             json.dump(figures, file, indent=1)

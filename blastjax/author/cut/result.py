@@ -1,20 +1,18 @@
 """From a tree of pieces to an asset with its meshes."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
+from blastjax.author import bonds, solids
 from blastjax.author.asset import Built, build
 from blastjax.author.cut import contacts, geometry
 from blastjax.author.cut.contacts import Contacts
 from blastjax.author.cut.tree import Tree
-from blastjax.author.descriptions import Bonds, Chunks, flags, reals
-from blastjax.author.mesh import Destructible, Mesh, moments
-from blastjax.core import WORLD
-
-TOUCH = 1e-6
-"""Distance from a plane, in extents of the solid, up to which a face lies in it."""
+from blastjax.author.descriptions import Bonds, flags
+from blastjax.author.mesh import Destructible, Mesh
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,53 +34,39 @@ def destructible(
     *,
     support_level: int | None = None,
     support: Any = None,
-    world: Any = None,
+    world: Sequence[Bonds] = (),
     dtype: Any = None,
 ) -> Result:
     """Make an asset of a tree of pieces: chunks, meshes, and bonds where they touch.
+
+    Bonds are exact: of flat cuts the face that both pieces have, of rough ones its area
+    and mean normal, also where later cuts divided the two sides differently.
 
     Args:
       tree: the pieces.
       support_level: how many cuts lie above the support chunks: 0 makes the solid the
         only one. Leaves above that level are support chunks too. None takes all leaves.
       support: (P,) bool instead, which pieces are support chunks.
-      world: pairs of a point and a normal out of the solid, each (3,): support chunks
-        are bonded to the world by their faces in these planes.
+      world: bonds to the world or others, such as `author.bonds.to_plane(tree.meshes,
+        ...)`; those of pieces that are no support chunks are dropped.
       dtype: of the asset's real arrays, as in `author.build`.
 
     Raises:
       ValueError: the support level is below 0, or both it and `support` are given.
     """
-    parent = np.array(tree.parent)
     chosen = _support(tree, support_level, support)
     found = [geometry.mesh(body, tree.skin) for body in tree.bodies]
     meshes = [mesh for mesh, _ in found]
-    measures = [moments(mesh) for mesh in meshes]
-    centroid = np.stack([center for _, center, _ in measures])
-    size = [
-        np.abs(mesh.vertices - center).max(axis=0)
-        for mesh, center in zip(meshes, centroid, strict=True)
-    ]
     low, high = tree.bounds()
-    scale = float((high - low).max())
-    shared = _contacts(found, chosen, scale)
-    warnings = list(tree.warnings)
-    bonds = _with_world(shared, _held(meshes, chosen, world, scale, warnings))
-    built = build(
-        Chunks(
-            parent=parent,
-            centroid=centroid,
-            volume=np.array([volume for volume, _, _ in measures]),
-            support=chosen,
-            size=np.stack(size),
-            inertia=np.stack([inertia for _, _, inertia in measures]),
-        ),
-        bonds,
-        dtype=dtype,
-    )
-    ordered: list[Mesh] = [meshes[i] for i in np.argsort(built.chunk_map)]
+    shared = _contacts(found, chosen, float((high - low).max()))
+    own = Bonds(shared.pieces, shared.normal, shared.area, shared.centroid)
+    chunks = solids.describe(meshes, np.array(tree.parent), chosen)
+    built = build(chunks, bonds.together(own, *world), dtype=dtype)
     return Result(
-        Destructible(built.asset, tuple(ordered)), built, shared, tuple(warnings)
+        Destructible(built.asset, solids.in_order(built, meshes)),
+        built,
+        shared,
+        tree.warnings,
     )
 
 
@@ -113,66 +97,4 @@ def _contacts(
         facets.append(facet[inner])
     return contacts.find(
         np.concatenate(corners), np.concatenate(piece), np.concatenate(facets), scale
-    )
-
-
-def _held(
-    meshes: list[Mesh],
-    support: np.ndarray,
-    world: Any,
-    scale: float,
-    warnings: list[str],
-) -> list[tuple[int, float, np.ndarray, np.ndarray]]:
-    """Return piece, area, centroid and normal of the bonds to the world."""
-    held: dict[int, tuple[float, np.ndarray, np.ndarray]] = {}
-    for point, normal in () if world is None else world:
-        point = reals("world point", point, (3,))
-        normal = reals("world normal", normal, (3,))
-        normal = normal / np.linalg.norm(normal)
-        bonded = 0
-        for i in np.flatnonzero(support):
-            mesh = meshes[i]
-            corners = mesh.vertices[mesh.faces]
-            vector = np.cross(
-                corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-            )
-            length = np.linalg.norm(vector, axis=1)
-            near = np.abs((corners - point) @ normal).max(axis=1) <= TOUCH * scale
-            flat = near & (vector @ normal > 0.999 * length) & (length > 0)
-            if not flat.any():
-                continue
-            area, middle = length[flat] / 2, corners[flat].mean(axis=1)
-            old = held.get(int(i), (0.0, np.zeros(3), np.zeros(3)))
-            held[int(i)] = (
-                old[0] + area.sum(),
-                old[1] + area @ middle,
-                old[2] + area.sum() * normal,
-            )
-            bonded += 1
-        if not bonded:
-            warnings.append(
-                f"nothing lies in the plane through {point.tolist()} facing "
-                f"{normal.tolist()}: no bond to the world there"
-            )
-    return [
-        (i, area, moment / area, vector / np.linalg.norm(vector))
-        for i, (area, moment, vector) in held.items()
-    ]
-
-
-def _with_world(
-    shared: Contacts, held: list[tuple[int, float, np.ndarray, np.ndarray]]
-) -> Bonds:
-    count = len(held)
-    return Bonds(
-        chunks=np.concatenate(
-            [shared.pieces, np.array([(i, WORLD) for i, *_ in held]).reshape(-1, 2)]
-        ).astype(int),
-        normal=np.concatenate(
-            [shared.normal, np.array([row[3] for row in held]).reshape(count, 3)]
-        ),
-        area=np.concatenate([shared.area, np.array([row[1] for row in held])]),
-        centroid=np.concatenate(
-            [shared.centroid, np.array([row[2] for row in held]).reshape(count, 3)]
-        ),
     )

@@ -48,6 +48,11 @@ class Tree:
         """(P,) m^3."""
         return np.array([body.volume() for body in self.bodies])
 
+    @property
+    def meshes(self) -> tuple[Mesh, ...]:
+        """The mesh of each piece."""
+        return tuple(self.mesh(i) for i in range(len(self.bodies)))
+
     def mesh(self, piece: int) -> Mesh:
         """Return the mesh of a piece."""
         return geometry.mesh(self.bodies[piece], self.skin)[0]

@@ -36,7 +36,7 @@ def arch(
     Raises:
       ValueError: a length is not above zero, or the rise is above half the span.
     """
-    _positive(span=span, rise=rise, thickness=thickness, width=width)
+    positive(span=span, rise=rise, thickness=thickness, width=width)
     (number,) = counts("voussoirs", (voussoirs,), 1)
     inner, outer = _ring(span, rise, thickness, number)
     meshes = _wedges(inner, outer, width)
@@ -76,7 +76,7 @@ def dome(
     Raises:
       ValueError: a length is not above zero, or there are too few stones.
     """
-    _positive(radius=radius, thickness=thickness)
+    positive(radius=radius, thickness=thickness)
     rings, segments = counts("rings and segments", (rings, segments), 2)
     if segments < 3:
         raise ValueError(f"segments is {segments}; a ring needs 3 or more")
@@ -131,7 +131,7 @@ def column(
     Raises:
       ValueError: a length is not above zero, or the sides do not fit the sectors.
     """
-    _positive(height=height, radius=radius, taper=taper)
+    positive(height=height, radius=radius, taper=taper)
     drums, sectors, sides = counts("drums, sectors, sides", (drums, sectors, sides), 3)
     if sides < 3 or sides % sectors or sectors == 2 == sides:
         raise ValueError(
@@ -197,8 +197,8 @@ def bridge(
       ValueError: a length is not above zero, the rise is above half the span, or the
         piers are too short for the springings.
     """
-    _positive(span=span, rise=rise, thickness=thickness, width=width, pier=pier)
-    _positive(height=height, fill=fill, deck=deck)
+    positive(span=span, rise=rise, thickness=thickness, width=width, pier=pier)
+    positive(height=height, fill=fill, deck=deck)
     spans, number, courses = counts(
         "spans, voussoirs, courses", (spans, voussoirs, courses), 3
     )
@@ -294,7 +294,8 @@ def _box(left: float, right: float, low: float, high: float, width: float) -> Me
     return _slab([(left, low), (right, low), (right, high), (left, high)], width)
 
 
-def _positive(**lengths: float) -> None:
+def positive(**lengths: float) -> None:
+    """Raise ValueError unless all are above zero."""
     for name, value in lengths.items():
         if not (np.isfinite(value) and value > 0):
             raise ValueError(f"{name} is {value}; it must be finite and above 0")
