@@ -97,7 +97,9 @@ def rest(kind, sites, seconds=4.0, impratio=10.0, vertices=32):
             used = state.bodies.label != NONE
             speed = jnp.max(jnp.where(used, jnp.linalg.norm(moved[:, :3], axis=1), 0))
             deep = -jnp.min(state.data._impl.contact.dist)
-            low = jnp.min(jnp.where(used, state.data.qpos[scene.host.slot_qpos][:, 2], 9))
+            low = jnp.min(
+                jnp.where(used, state.data.qpos[scene.host.slot_qpos][:, 2], 9)
+            )
             residual = events.solver.residual
             return state, jnp.stack([speed, deep, low, jnp.sum(used), residual])
 
@@ -139,7 +141,7 @@ def against_c(count=8, seconds=1.0):
         spec = mujoco.MjSpec.from_string(FLOOR.format(1))
         spec.option.iterations, spec.option.tolerance = 100, 1e-10
         spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
-        body = spec.worldbody.add_body(pos=center + [0, 0, drop])
+        body = spec.worldbody.add_body(pos=center + np.array([0, 0, drop]))
         body.add_freejoint()
         spec.add_mesh(name="m", uservert=(mesh.vertices - center).reshape(-1))
         body.add_geom(
@@ -186,7 +188,9 @@ def main():
                 f"{row['step_ms']:8.2f}"
             )
         both = {n: r["trace"] + r["compile"] for n, r in rows.items()}
-        print(f"ratio hulls / boxes, trace + compile: {both['hulls'] / both['boxes']:.2f}")
+        print(
+            f"ratio hulls / boxes, trace + compile: {both['hulls'] / both['boxes']:.2f}"
+        )
     if options.only in (None, "rest"):
         result["rest"] = {}
         for kind, sites in (("slab", 12), ("vase", 12)):
