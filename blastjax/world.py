@@ -150,7 +150,7 @@ def init(
     """
     if state is None:
         state = fracture.init(scene.asset, bond_health, chunk_health)
-    data = engine.without_matrices(mjx.make_data(scene.model, impl="jax"))
+    data = engine.without_matrices(contact.make_data(scene))
     return _begin(scene, data, state, velocity, spin, remove_dead)
 
 
