@@ -34,12 +34,10 @@ LEAST_AGGREGATE = 6
 """Nodes of an aggregate at least."""
 CLUSTER = 8
 """Most nodes that the smoother solves for together."""
-CLUSTER_SHIFT = 30.0
-"""Roundings added to the unit diagonal of a cluster's matrix."""
+NULL_PIVOT = 16.0
+"""Roundings of a unit diagonal, up to which what elimination left of it is nothing."""
 DAMPING = 2 / 3
 """Of the smoother, which overshoots by a factor of 2 at most."""
-COARSE_SHIFTS = (8.0, 256.0, 8192.0)
-"""Roundings added to the coarse matrix's unit diagonal: the least that serves."""
 NOISE = 30
 """Roundings of its load up to which a piece counts as unloaded."""
 STALE_STEPS = 20
@@ -487,15 +485,19 @@ def _balanced(frame: _Frame, structure: Structure, load: Load) -> jax.Array:
 
 
 def _solve_3x3(matrix: jax.Array, right: jax.Array) -> jax.Array:
-    """Solve (n, 3, 3) x = (n, 3) by cofactors; 0 where the matrix is singular."""
+    """Solve (n, 3, 3) x = (n, 3); 0 where the matrix is singular."""
     scale = jax.lax.stop_gradient(jnp.max(jnp.abs(matrix), axis=(1, 2)))
     scale = jnp.where(scale > 0, scale, 1)
-    matrix = matrix / scale[:, None, None]
+    inverse = _inverse_3x3(matrix / scale[:, None, None])
+    return jnp.einsum("nij,nj->ni", inverse, right / scale[:, None])
+
+
+def _inverse_3x3(matrix: jax.Array) -> jax.Array:
+    """Invert matrices (n, 3, 3) by cofactors; 0 where they are singular."""
     a, b, c = matrix[:, 0], matrix[:, 1], matrix[:, 2]
     cofactors = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)], axis=-1)
     determinant = spatial.dot(a, jnp.cross(b, c))
-    inverse = spatial.ratio(cofactors, determinant[:, None, None])
-    return jnp.einsum("nij,nj->ni", inverse, right / scale[:, None])
+    return spatial.ratio(cofactors, determinant[:, None, None])
 
 
 Target = tuple[jax.Array, jax.Array]
@@ -607,9 +609,7 @@ def _smoother(frame: _Frame, structure: Structure) -> Any:
     used = diagonal > 0
     unit = jnp.where(used, jax.lax.rsqrt(jnp.where(used, diagonal, 1)), 0)
     matrix = unit[:, :, None] * matrix * unit[:, None, :]
-    shift = jnp.where(used, CLUSTER_SHIFT * jnp.finfo(matrix.dtype).eps, 1)
-    eye = jnp.eye(6 * size, dtype=matrix.dtype)[None]
-    inverse = jnp.linalg.inv(matrix + shift.astype(matrix.dtype)[:, :, None] * eye)
+    inverse = _inverse(matrix)
     inverse = unit[:, :, None] * inverse * unit[:, None, :]
 
     def smooth(residual: jax.Array) -> jax.Array:
@@ -618,6 +618,49 @@ def _smoother(frame: _Frame, structure: Structure) -> Any:
         return jnp.zeros_like(residual).at[nodes].set(answer, mode="drop")
 
     return smooth
+
+
+def _inverse(matrix: jax.Array) -> jax.Array:
+    """Invert semidefinite matrices (m, 6 n, 6 n) of unit diagonal, six rows at a time.
+
+    Rows that depend on those before, but for rounding, are left out: zero in the
+    inverse, which is thus never indefinite.
+
+    Not by LAPACK: on a CPU, JAX's calls of it hand parts of large batches to the thread
+    pool that they occupy themselves. As many calls side by side as there are threads
+    wait for ever.
+    """
+    rows = jnp.arange(matrix.shape[-1], dtype=jnp.int32) // 6
+
+    def sweep(k: jax.Array, matrix: jax.Array) -> jax.Array:
+        mine = rows == k
+        row = jax.lax.dynamic_slice_in_dim(matrix, 6 * k, 6, 1)
+        column = jax.lax.dynamic_slice_in_dim(matrix, 6 * k, 6, 2)
+        pivot = _inverse_6x6(jax.lax.dynamic_slice_in_dim(row, 6 * k, 6, 2))
+        row = pivot @ jnp.where(mine[None, None], 0, row)
+        column = jnp.where(mine[None, :, None], 0, column)
+        matrix = matrix - column @ row
+        matrix = jax.lax.dynamic_update_slice_in_dim(matrix, row, 6 * k, 1)
+        pivots = jnp.tile(pivot, (1, rows.shape[0] // 6, 1))
+        column = jnp.where(mine[None, :, None], pivots, -(column @ pivot))
+        return jax.lax.dynamic_update_slice_in_dim(matrix, column, 6 * k, 2)
+
+    return jax.lax.fori_loop(0, rows.shape[0] // 6, sweep, matrix)
+
+
+def _inverse_6x6(matrix: jax.Array) -> jax.Array:
+    """Invert semidefinite matrices (m, 6, 6), dependent rows left out."""
+    least = NULL_PIVOT * jnp.finfo(matrix.dtype).eps
+    for k in range(6):
+        mine = jnp.arange(6, dtype=jnp.int32) == k
+        pivot = matrix[:, k, k]
+        pivot = jnp.where(pivot > least, 1 / jnp.where(pivot > least, pivot, 1), 0)
+        row = jnp.where(mine[None], 1, pivot[:, None] * matrix[:, k])
+        column = jnp.where(mine[None], -1, matrix[:, :, k])
+        row = jnp.where(mine[None], pivot[:, None], row)
+        rest = jnp.where(mine[None, :, None] | mine[None, None], 0, matrix)
+        matrix = rest - column[:, :, None] * row[:, None]
+    return matrix
 
 
 def _bond_blocks(frame: _Frame, lever: jax.Array, moves: jax.Array) -> jax.Array:
@@ -664,7 +707,7 @@ def _coarse(frame: _Frame, structure: Structure) -> Any:
     usable = diagonal > 0
     unit = jnp.where(usable, jax.lax.rsqrt(jnp.where(usable, diagonal, 1)), 0)
     matrix = unit[:, None] * matrix * unit[None, :]
-    factor = _factor(matrix, usable)
+    inverse = _inverse(matrix[None])[0]
 
     def correct(residual: jax.Array) -> jax.Array:
         force, torque = (
@@ -673,31 +716,12 @@ def _coarse(frame: _Frame, structure: Structure) -> Any:
         )
         total = jnp.concatenate([force, torque], axis=1)
         total = graph.group_sum(total, member, groups).reshape(-1)
-        answer = unit * jax.scipy.linalg.cho_solve((factor, True), unit * total)
+        answer = unit * (inverse @ (unit * total))
         motion = _rows(answer.reshape(groups, 6), member)
         move = motion[:, :3] + jnp.cross(motion[:, 3:], arm)
         return jnp.concatenate([move, motion[:, 3:]], axis=1)
 
     return correct
-
-
-def _factor(matrix: jax.Array, usable: jax.Array) -> jax.Array:
-    """Return the Cholesky factor, shifted as little as makes it one."""
-    eps = jnp.finfo(matrix.dtype).eps
-
-    def shifted(shift: float) -> jax.Array:
-        diagonal = jnp.where(usable, shift * eps, 1).astype(matrix.dtype)
-        return jnp.linalg.cholesky(matrix + jnp.diag(diagonal))
-
-    def failed(factor: jax.Array) -> jax.Array:
-        return ~jnp.isfinite(jnp.sum(jnp.diagonal(factor)))
-
-    factor = shifted(COARSE_SHIFTS[0])
-    for shift in COARSE_SHIFTS[1:]:
-        factor = jax.lax.cond(
-            failed(factor), lambda shift=shift: shifted(shift), lambda f=factor: f
-        )
-    return factor
 
 
 def _rigid(lever: jax.Array) -> jax.Array:
