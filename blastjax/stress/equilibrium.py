@@ -34,7 +34,9 @@ LEAST_AGGREGATE = 6
 """Nodes of an aggregate at least."""
 CLUSTER = 8
 """Most nodes that the smoother solves for together."""
-NULL_PIVOT = 16.0
+COARSE_SHIFT = 8.0
+"""Roundings added to the unit diagonal of the coarse matrix."""
+NULL_PIVOT = 4.0
 """Roundings of a unit diagonal, up to which what elimination left of it is nothing."""
 DAMPING = 2 / 3
 """Of the smoother, which overshoots by a factor of 2 at most."""
@@ -303,7 +305,10 @@ def solve(
     dtype = asset.chunk_centroid.dtype
     if tolerance is None:
         tolerance = 1e-10 if dtype == jnp.float64 else 1e-6
+    if not asset.bond_area.shape[0]:
+        return _nothing(dtype)
     frame = _frame(structure, asset, state)
+    load, peak = _unit_load(load, frame)
     right = _balanced(frame, structure, load)
     scale = jax.lax.stop_gradient(_size(right))
     scale = jnp.where(scale > 0, scale, 1.0)
@@ -337,15 +342,31 @@ def solve(
         symmetric=True,
         has_aux=True,
     )
-    bond = scale * frame.root * strain
+    bond = frame.root * strain * scale * jnp.where(jnp.isfinite(peak), peak, 0)
+    # A load that is no number, or too large for one, bears no answer.
+    fits = jnp.isfinite(peak) & jnp.isfinite(jnp.max(jnp.abs(bond)))
+    bond = jnp.where(fits, bond, 0)
     return Solution(
         force=bond[:, :3],
         torque=bond[:, 3:] * frame.length,
-        residual=residual,
+        residual=jnp.where(fits, residual, jnp.inf),
         iterations=count,
-        converged=residual <= tolerance,
+        converged=fits & (residual <= tolerance),
         strain=strain,
         carries=frame.alive,
+    )
+
+
+def _nothing(dtype: Any) -> Solution:
+    """Return the solution of an asset without bonds."""
+    return Solution(
+        force=jnp.zeros((0, 3), dtype),
+        torque=jnp.zeros((0, 3), dtype),
+        residual=jnp.zeros((), dtype),
+        iterations=jnp.zeros((), jnp.int32),
+        converged=jnp.ones((), bool),
+        strain=jnp.zeros((0, 6), dtype),
+        carries=jnp.zeros(0, bool),
     )
 
 
@@ -412,6 +433,20 @@ def _frame(structure: Structure, asset: Asset, state: State) -> _Frame:
         floats=is_chunk & ~held,
         length=length,
     )
+
+
+def _unit_load(load: Load, frame: _Frame) -> tuple[Load, jax.Array]:
+    """Return a load of largest entry 1, whose square is a number, and what it was."""
+    both = jnp.stack([load.force, load.torque / frame.length])
+    both = jnp.where(frame.bears[None, :, None], both, 0)
+    peak = jax.lax.stop_gradient(jnp.max(jnp.abs(both)))
+    scale = jnp.where(jnp.isfinite(peak) & (peak > 0), peak, 1)
+
+    def unit(x: jax.Array) -> jax.Array:
+        x = jnp.where(frame.bears[:, None] & jnp.isfinite(x), x, 0)
+        return x / scale
+
+    return Load(force=unit(load.force), torque=unit(load.torque)), peak
 
 
 def _rows(values: jax.Array, index: jax.Array) -> jax.Array:
@@ -707,6 +742,8 @@ def _coarse(frame: _Frame, structure: Structure) -> Any:
     usable = diagonal > 0
     unit = jnp.where(usable, jax.lax.rsqrt(jnp.where(usable, diagonal, 1)), 0)
     matrix = unit[:, None] * matrix * unit[None, :]
+    shift = COARSE_SHIFT * jnp.finfo(matrix.dtype).eps
+    matrix = matrix + jnp.diag(jnp.where(usable, shift, 0).astype(matrix.dtype))
     inverse = _inverse(matrix[None])[0]
 
     def correct(residual: jax.Array) -> jax.Array:
@@ -716,7 +753,10 @@ def _coarse(frame: _Frame, structure: Structure) -> Any:
         )
         total = jnp.concatenate([force, torque], axis=1)
         total = graph.group_sum(total, member, groups).reshape(-1)
-        answer = unit * (inverse @ (unit * total))
+        total = unit * total
+        answer = inverse @ total
+        # Slender structures ask for more digits than an inverse has.
+        answer = unit * (answer + inverse @ (total - matrix @ answer))
         motion = _rows(answer.reshape(groups, 6), member)
         move = motion[:, :3] + jnp.cross(motion[:, 3:], arm)
         return jnp.concatenate([move, motion[:, 3:]], axis=1)
