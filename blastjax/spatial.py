@@ -78,3 +78,14 @@ def rotate(vector: jax.Array, quaternion: jax.Array) -> jax.Array:
 def conjugate(quaternion: jax.Array) -> jax.Array:
     """Return the inverse rotation of (..., 4) unit quaternions."""
     return jnp.concatenate([quaternion[..., :1], -quaternion[..., 1:]], axis=-1)
+
+
+def matrix(quaternion: jax.Array) -> jax.Array:
+    """Return (..., 4) unit quaternions as rotation matrices (..., 3, 3)."""
+    w, x, y, z = jnp.moveaxis(quaternion, -1, 0)
+    rows = [
+        [w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z],
+    ]
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)

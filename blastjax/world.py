@@ -7,17 +7,17 @@ pairs of chunks) is not in the program.
 """
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from mujoco import mjx
 
 from blastjax import chunks, fracture, graph, pytree, spatial
 from blastjax.core import NONE, Damage, FractureEvents, SplitEvents, State
 from blastjax.damage import falloff
-from blastjax.rigid import bodies, contact, engine, solver
+from blastjax.rigid import bodies, contact, engine, rows, solver
 from blastjax.rigid.scene import Scene
 from blastjax.stress.equilibrium import Structure
 from blastjax.stress.failure import Verdict, judge, stress_damage
@@ -220,10 +220,9 @@ def step(
     data = bodies.place(scene, riding, data)
     data = bodies.kinematics(scene, model, riding, data)
     data, found = contact.collide(scene, riding, model, data)
-    data = engine.constraint_rows(model, data, found.riders.body)
     data = engine.position_sensors(model, data)
     data = engine.smooth_acceleration(model, data, bodies.empty_dofs(scene, riding))
-    data, report = contact.resolve(model, data, scene.line_search)
+    data, report = rows.resolve(scene, model, data, riding, frames, found.riders)
     data = engine.integrate(model, data)
     force = contact.normal_force(data)
 
@@ -260,6 +259,45 @@ def step(
         damage=damage, fracture=broken, split=parted, removed=removed
     )
     return world, events
+
+
+def rollout(
+    scene: Scene,
+    world: World,
+    length: int,
+    *,
+    ctrl: jax.Array | None = None,
+    record: Callable[[World, Events], Any] | None = None,
+    **options: Any,
+) -> tuple[World, Any]:
+    """Advance by many steps, in little memory when differentiated in reverse.
+
+    Args:
+      scene: the scene.
+      world: the world.
+      length: number of steps.
+      ctrl: (length, nu) controls of each step; by default those in the data.
+      record: what to keep of each step, of the world after it and its events.
+      **options: of `step`, the same for all steps.
+
+    Returns:
+      The world at its end, and the records, stacked (length, ...); None without.
+      Derivatives are those of `step`, forward and reverse. Reverse mode keeps one
+      world a step, and computes each step a second time to get at its inside.
+
+    Raises:
+      ValueError: `length` is below 1.
+    """
+    if length < 1:
+        raise ValueError(f"length is {length}; give 1 or more")
+
+    def one(world: World, ctrl: jax.Array | None) -> tuple[World, Any]:
+        world, events = step(scene, world, ctrl=ctrl, **options)
+        return world, None if record is None else record(world, events)
+
+    # Within a scan nothing can be shared with the first time anyway.
+    again = jax.checkpoint(one, prevent_cse=False)
+    return jax.lax.scan(again, world, ctrl, length=length)
 
 
 def impact_damage(
@@ -367,7 +405,7 @@ def contact_load(
     num_nodes, touch = place.shape[0], data._impl.contact
     element = jnp.asarray(scene.host.geom_element, jnp.int32)
     total = Load(force=jnp.zeros_like(place), torque=jnp.zeros_like(place))
-    push = contact_force(data)
+    push = engine.contact_force(data)
     for side in scene.host.chunk_sides:
         geom = touch.geom[:, side]
         slot = jnp.maximum(carried.slot[geom], 0)
@@ -382,30 +420,6 @@ def contact_load(
         )
         total = add(total, part)
     return total
-
-
-def contact_force(data: mjx.Data) -> jax.Array:
-    """Return the force of each contact on its second geom, (contacts, 3) N, world axes.
-
-    Friction of rolling and twisting is left out.
-    """
-    impl = data._impl
-    touch, start = impl.contact, impl.ne + impl.nf + impl.nl
-    parts = []
-    for size in (1, 3, 4, 6):
-        count = int(np.sum(touch.dim == size))
-        rows = 1 if size == 1 else 2 * (size - 1)
-        block = impl.efc_force[start : start + count * rows].reshape(count, rows)
-        start += count * rows
-        local = jnp.zeros((count, 3), block.dtype).at[:, 0].set(block.sum(axis=1))
-        if size > 1:
-            # Opposite edges of the pyramid: their difference is the friction.
-            edges = block[:, :4].reshape(count, 2, 2)
-            local = local.at[:, 1:].set(edges[..., 0] - edges[..., 1])
-        parts.append(local)
-    local = jnp.concatenate(parts)
-    local = local.at[:, 1:].multiply(touch.friction[:, :2])
-    return jnp.einsum("ni,nij->nj", local, touch.frame)
 
 
 def _strain(state: State, verdict: Verdict, stress: Stress) -> Damage:
