@@ -619,7 +619,7 @@ def test_canary_private_names():
         ({"density": np.ones(3)}, "density has shape"),
         ({"density": np.r_[np.ones(7), -1.0]}, "density of chunk 7 is -1.0"),
         ({"friction": -1.0}, "friction is -1.0"),
-        ({"collision": "mesh"}, "collision is 'mesh'; use"),
+        ({"collision": "mesh"}, "collision is 'mesh', .*use 'hull'"),
         ({"timestep": 0.0}, "timestep is 0.0"),
         ({"max_contacts": 0}, "max_contacts is 0"),
         ({"iterations": 0}, "iterations 0"),
