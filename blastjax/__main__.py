@@ -17,6 +17,15 @@ COMMANDS = {
 }
 
 
+class _Help(argparse.ArgumentDefaultsHelpFormatter):
+    """Help that names defaults where there are some."""
+
+    def _get_help_string(self, action: argparse.Action) -> str | None:
+        if action.default is None or action.default is False or action.default == []:
+            return action.help
+        return super()._get_help_string(action)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command and return the exit code; bad options exit with 2."""
     words = list(sys.argv[1:] if argv is None else argv)
@@ -32,7 +41,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         prog=program,
         description=command.help,
         epilog=about,
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        formatter_class=_Help,
     )
     command.options(parser)
     args = parser.parse_args(words)

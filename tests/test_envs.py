@@ -4,9 +4,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import trimesh
 from brax.envs.wrappers import training
 
 from blastjax import envs
+from blastjax.author import bonds, cut
+from blastjax.envs import breach
 
 SMALL = {
     "bricks": 2,
@@ -165,3 +168,35 @@ def test_default_wall_breaks_and_falls():
     # m/s: nothing leaves faster than the ball came.
     velocity = state.pipeline_state.world.data.qvel[env.scene.host.slot_dof][:, :3]
     assert float(jnp.abs(velocity).max()) < env.config.speed[1]
+
+
+@pytest.fixture(scope="module")
+def block():
+    """Return the tree of a block twice the wall's length, off the origin."""
+    tree = cut.solid(trimesh.creation.box((4.0, 0.8, 2.0)))
+    return cut.voronoi(tree, cut.uniform(tree, 6, seed=1))
+
+
+def test_another_asset_stands_in_the_walls_place(block):
+    held = bonds.to_plane(block.meshes, (0, 0, -1), (0, 0, -1))
+    what = cut.destructible(block, world=[held]).destructible
+    env = envs.Breach(asset=what, slots=3)
+    assert env.bricks == 6 and env.scene.hulls is not None
+    np.testing.assert_allclose(env.scene.position, (0, 0, 1), atol=1e-6)
+    np.testing.assert_allclose(env._extent(), [(-2, 0), (2, 2)], atol=1e-6)
+    # Twice as long as the wall; as heavy for it as the wall's ball is for the wall.
+    config, usual = env.config, breach.Config()
+    np.testing.assert_allclose(config.ball_radius, 2 * usual.ball_radius, rtol=1e-6)
+    share = usual.ball_mass / (2.0 * 0.2 * 1.0 * usual.density)
+    np.testing.assert_allclose(
+        config.ball_mass, share * 4.0 * 0.8 * 2.0 * usual.density, rtol=1e-5
+    )
+    low, high = env.observation_limits
+    assert low.shape == high.shape == (3 * 6 + 8,)
+    boxes = envs.Breach(asset=what.asset, slots=3)
+    assert boxes.scene.hulls is None
+
+
+def test_an_asset_that_nothing_holds_is_refused(block):
+    with pytest.raises(ValueError, match="not bonded to the world"):
+        envs.Breach(asset=cut.destructible(block).destructible)

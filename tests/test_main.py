@@ -31,6 +31,16 @@ def test_help_names_every_option(capsys):
     assert all(option in said for option in OPTIONS)
 
 
+def test_help_of_fracture(capsys):
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["fracture", "--help"])
+    assert stop.value.code == 0
+    said = capsys.readouterr().out
+    for option in ("--sites", "--pattern", "--then", "--noise", "--hold", "--scale"):
+        assert option in said
+    assert "default: 64" in said and "None" not in said
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [

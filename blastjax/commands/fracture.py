@@ -34,8 +34,11 @@ def options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("mesh", help="file of a closed mesh: .stl, .obj, .ply, .glb, .off, ...")
     add("--out", default="asset.npz", help="asset file to write")
-    add("--picture", help="exploded view to write, .png; 'none' for none (default: "
-        "beside the asset file)")  # fmt: skip
+    add(
+        "--picture",
+        help="exploded view to write, .png; 'none' for none (default: "
+        "beside the asset file)",
+    )
     add("--scale", type=number(), default=1.0, help="from the file's unit to metres")
     add("--up", choices=tuple(_UP), default="z", help="the file's upward axis")
     add("--no-repair", action="store_true", help="refuse meshes that need repair")
@@ -50,31 +53,80 @@ def options(parser: argparse.ArgumentParser) -> None:
     add("--sites", type=whole(2), default=64, help="Voronoi cells")
     add("--clusters", type=whole(1), default=4, help="groups of clustered sites")
     add("--spread", type=number(), default=0.1, help="of a cluster, in diagonals")
-    add("--spokes", type=whole(3), default=8, help="radial sites on a ring; the rings "
-        "follow from --sites")  # fmt: skip
-    add("--stretch", type=number(), nargs=3, metavar=("X", "Y", "Z"),
-        help="lengthens Voronoi cells by these factors")  # fmt: skip
-    add("--slices", type=whole(1), nargs=3, metavar=("X", "Y", "Z"), default=(3, 3, 3),
-        help="slices along each axis")  # fmt: skip
-    add("--offset", type=number(-1e-9, 1.0), default=0.0, help="variation of slices, "
-        "0 to 1")  # fmt: skip
-    add("--angle", type=number(-1e-9, 80.0), default=0.0, help="largest tilt of slices,"
-        " degrees")  # fmt: skip
-    add("--brick", type=number(), nargs=3, metavar=("X", "Y", "Z"),
-        default=(0.4, 0.2, 0.2), help="extent of a brick, m")  # fmt: skip
-    add("--bitmap", help="picture whose dark and light regions `cutout` cuts, seen "
-        "along y")  # fmt: skip
-    add("--noise", type=number(), nargs=2, metavar=("HEIGHT", "LENGTH"),
-        help="roughness of the cuts, and its wavelength, m")  # fmt: skip
+    add(
+        "--spokes",
+        type=whole(3),
+        default=8,
+        help="radial sites on a ring; the rings follow from --sites",
+    )
+    add(
+        "--stretch",
+        type=number(),
+        nargs=3,
+        metavar=("X", "Y", "Z"),
+        help="lengthens Voronoi cells by these factors",
+    )
+    add(
+        "--slices",
+        type=whole(1),
+        nargs=3,
+        metavar=("X", "Y", "Z"),
+        default=(3, 3, 3),
+        help="slices along each axis",
+    )
+    add(
+        "--offset",
+        type=number(-1e-9, 1.0),
+        default=0.0,
+        help="variation of slices, 0 to 1",
+    )
+    add(
+        "--angle",
+        type=number(-1e-9, 80.0),
+        default=0.0,
+        help="largest tilt of slices, degrees",
+    )
+    add(
+        "--brick",
+        type=number(),
+        nargs=3,
+        metavar=("X", "Y", "Z"),
+        default=(0.4, 0.2, 0.2),
+        help="extent of a brick, m",
+    )
+    add(
+        "--bitmap",
+        help="picture whose dark and light regions `cutout` cuts, seen along y",
+    )
+    add(
+        "--noise",
+        type=number(),
+        nargs=2,
+        metavar=("HEIGHT", "LENGTH"),
+        help="roughness of the cuts, and its wavelength, m",
+    )
     add("--seed", type=whole(0), default=0, help="of all random choices")
     group = parser.add_argument_group("hierarchy and bonds")
     add = group.add_argument
-    add("--then", type=whole(2), action="append", default=[], metavar="SITES",
-        help="cut every chunk again into so many cells; may be repeated")  # fmt: skip
-    add("--support-level", type=whole(0), help="cuts above the support chunks "
-        "(default: the deepest)")  # fmt: skip
-    add("--hold", choices=("bottom", "none"), default="bottom", help="what the world "
-        "holds: faces in the lowest plane, or nothing")  # fmt: skip
+    add(
+        "--then",
+        type=whole(2),
+        action="append",
+        default=[],
+        metavar="SITES",
+        help="cut every chunk again into so many cells; may be repeated",
+    )
+    add(
+        "--support-level",
+        type=whole(0),
+        help="cuts above the support chunks (default: the deepest)",
+    )
+    add(
+        "--hold",
+        choices=("bottom", "none"),
+        default="bottom",
+        help="what the world holds: faces in the lowest plane, or nothing",
+    )
 
 
 def run(args: argparse.Namespace, parser: argparse.ArgumentParser) -> int:

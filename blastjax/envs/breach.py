@@ -157,7 +157,7 @@ class Breach(Env):
             top = config.courses * config.brick[2]
             self._low, self._high = -half, half + np.array([0, 0, top])
         else:
-            low, high = _bounds(_bare(asset))
+            low, high = _bounds(asset)
             position = -np.array([low[0] + high[0], low[1] + high[1], 2 * low[2]]) / 2
             self._low, self._high = low + position, high + position
         if collision is None:
@@ -421,8 +421,9 @@ def fitted(asset: Asset | Destructible) -> Config:
     Lengths go with its largest extent; masses, forces and impulses with its mass; speed
     with the root of its size, as falls do. The timestep stays.
     """
-    base, asset = Config(), _bare(asset)
+    base = Config()
     low, high = _bounds(asset)
+    asset = _bare(asset)
     wall = np.prod(base.brick) * base.bricks * base.courses
     nodes = np.asarray(asset.element_chunk)[: len(asset.span_node)]
     volume = np.asarray(asset.chunk_volume, float)[nodes[nodes >= 0]].sum()
@@ -446,12 +447,13 @@ def _bare(asset: Asset | Destructible) -> Asset:
     return asset.asset if isinstance(asset, Destructible) else asset
 
 
-def _bounds(asset: Asset) -> tuple[np.ndarray, np.ndarray]:
+def _bounds(whole: Asset | Destructible) -> tuple[np.ndarray, np.ndarray]:
     """Return the least and greatest corner of an asset's support chunks.
 
     Raises:
       ValueError: it is not bonded to the world.
     """
+    asset = _bare(whole)
     nodes = np.asarray(asset.element_chunk)[: len(asset.span_node)]
     if not asset.has_world or nodes[0] != WORLD:
         raise ValueError(
@@ -459,6 +461,9 @@ def _bounds(asset: Asset) -> tuple[np.ndarray, np.ndarray]:
             "start; add bonds to the world"
         )
     brick = nodes[nodes >= 0]
+    if isinstance(whole, Destructible):
+        points = np.concatenate([whole.meshes[i].vertices for i in brick])
+        return points.min(axis=0), points.max(axis=0)
     center, size = (
         np.asarray(x, float)[brick] for x in (asset.chunk_centroid, asset.chunk_size)
     )

@@ -43,6 +43,43 @@ def exactness(sites):
     return rows
 
 
+def patterns():
+    """Print a row for each pattern on the vase and return them."""
+    print("\nthe vase by    pieces     bonds    volume   overlap     sides  unbonded")
+    rows = []
+    for name, make in PATTERNS.items():
+        tree = make(cut.solid(solids.vase()))
+        result = cut.destructible(tree)
+        found = solids.figures(tree, result)
+        row = {"pattern": name, "pieces": len(tree.leaves)}
+        row |= {"bonds": len(result.contacts.area), **found}
+        rows.append(row)
+        exact = ("volume", "overlap", "sides", "unbonded")
+        cells = [f"{row[k]:9.1e}" for k in exact]
+        print(f"{name:12s}{row['pieces']:9d}{row['bonds']:10d}", *cells)
+    return rows
+
+
+def _nested(solid):
+    tree = cut.voronoi(solid, cut.uniform(solid, 8, seed=0))
+    return cut.voronoi(tree, cut.uniform(tree, 8, seed=1))
+
+
+NOISE = cut.Noise(0.01, 0.2, 2)
+PATTERNS = {
+    "clusters": lambda s: cut.voronoi(s, cut.clustered(s, 4, 16)),
+    "rings": lambda s: cut.voronoi(
+        s, cut.radial((0.3, 0, 0.3), (1, 0, 0), radius=0.6, rings=5, spokes=9)
+    ),
+    "stretched": lambda s: cut.voronoi(s, cut.uniform(s, 64), stretch=(1, 1, 3)),
+    "slices": lambda s: cut.slices(s, (4, 4, 4), offset=0.5, angle=0.2),
+    "bricks": lambda s: cut.bricks(s, (0.15, 0.1, 0.06)),
+    "two levels": _nested,
+    "rough cells": lambda s: cut.voronoi(s, cut.uniform(s, 32), noise=NOISE),
+    "rough slices": lambda s: cut.slices(s, (3, 3, 3), noise=NOISE),
+}
+
+
 def speed(repeats):
     """Print and return the time of 256 cells of a box and of 10,000 triangles."""
     rows = []
@@ -102,7 +139,8 @@ def main():
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--json", help="file to write the figures to")
     args = parser.parse_args()
-    result = {"exactness": exactness(args.sites), "speed": speed(args.repeats)}
+    result = {"exactness": exactness(args.sites), "patterns": patterns()}
+    result["speed"] = speed(args.repeats)
     if args.json:
         with open(args.json, "w") as file:
             json.dump(result, file, indent=1, default=float)

@@ -85,7 +85,8 @@ def _united(found: Sequence[Bonds]) -> Bonds:
     upright = np.array([0.0, 0.0, 1.0])
     normal = np.where(length > 0, totals[:, 1:4] / np.where(length > 0, length, 1), 0)
     normal = np.where(length > 1e-6 * totals[:, :1], normal, upright)
-    return Bonds(pairs, normal, totals[:, 0], totals[:, 4:] / totals[:, :1])
+    centroid = totals[:, 4:] / np.where(totals[:, :1] > 0, totals[:, :1], 1)
+    return Bonds(pairs, normal, totals[:, 0], centroid)
 
 
 def _support(tree: Tree, level: int | None, support: Any) -> np.ndarray:
