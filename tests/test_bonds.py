@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from blastjax import author
-from blastjax.author import bonds, clip, solids
+from blastjax.author import bonds, clip, cut, solids
 from blastjax.author.overlap import box_pairs
 from blastjax.core import WORLD
 
@@ -110,6 +110,19 @@ def test_shared_area_of_triangles_against_sampling():
         if both.mean() > 0.01:
             np.testing.assert_allclose(centroid[k, :2], grid[both].mean(0), atol=5e-3)
     assert (area > 0.01).sum() > 8
+
+
+def test_bonds_of_a_cut_are_found_again_from_its_meshes():
+    pytest.importorskip("manifold3d")
+    trimesh = pytest.importorskip("trimesh")
+    tree = cut.solid(trimesh.creation.torus(1.0, 0.35))
+    whole = cut.destructible(cut.voronoi(tree, cut.uniform(tree, 24))).destructible
+    leaf = np.flatnonzero(np.asarray(whole.asset.chunk_children) == 0)
+    found = bonds.between([whole.meshes[i] for i in leaf])
+    found = author.Bonds(leaf[found.chunks], found.normal, found.area, found.centroid)
+    wanted = author.describe(whole.asset)[1]
+    for a, b in zip(sorted_bonds(found), sorted_bonds(wanted), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6)
 
 
 def test_bonds_to_the_world():
