@@ -46,6 +46,9 @@ def test_joint_is_bonded_midway_within_the_gap():
     np.testing.assert_allclose(found.area, [3.0])
     np.testing.assert_allclose(found.normal, [[1, 0, 0]])
     np.testing.assert_allclose(found.centroid, [[1.05, 0.25, 0]], atol=1e-12)
+    # Boxes that overlap at their edges, of which no faces look at each other.
+    aside = solids.box(np.array([1.95, 1.95, 0]), np.ones(3))
+    assert not len(bonds.between([one, aside], gap=0.02).area)
     # As deep may they overlap.
     deep = solids.box(np.array([1.95, 0, 0]), np.ones(3))
     np.testing.assert_allclose(bonds.between([one, deep], gap=0.1).area, [4.0])
