@@ -232,17 +232,52 @@ def _facing(
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
     """Yield pair, triangle, triangle and mean normal of what look at each other."""
     for some in _portions(soup.count[pairs].sum(axis=1)):
-        one, row = soup.near(pairs[some, 0], pairs[some, 1], gap)
-        others, other_row = soup.near(pairs[some, 1], pairs[some, 0], gap)
-        many = np.bincount(other_row, minlength=some.stop - some.start)
-        first = np.cumsum(many) - many
-        for part in _portions(many[row]):
-            times = many[row[part]]
-            i = np.repeat(one[part], times)
-            j = others[ranges(first[row[part]], times)]
+        a, b = pairs[some].T
+        one, row = soup.near(a, b, gap)
+        others, other_row = soup.near(b, a, gap)
+        others, first, many = _windows(soup, a, b, one, row, others, other_row, gap)
+        for part in _portions(many):
+            times = many[part]
+            i, j = np.repeat(one[part], times), others[ranges(first[part], times)]
             owner = np.repeat(row[part], times) + some.start
             keep, normal = _look(soup, i, j, gap, facing)
             yield owner[keep], i[keep], j[keep], normal
+
+
+def _windows(
+    soup: _Soup,
+    a: np.ndarray,
+    b: np.ndarray,
+    one: np.ndarray,
+    row: np.ndarray,
+    others: np.ndarray,
+    other_row: np.ndarray,
+    gap: float,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the others in a new order, and for each triangle a range of them.
+
+    Those of a pair are sorted along the longest axis of what its pieces' boxes share,
+    and the range holds all that may meet the triangle along that axis.
+    """
+    shared = np.minimum(soup.piece_high[a], soup.piece_high[b])
+    shared = shared - np.maximum(soup.piece_low[a], soup.piece_low[b])
+    axis = np.argmax(shared, axis=1)
+    lowest = soup.low.min()
+    reach = float(soup.high.max() - lowest) + gap
+    slack = gap + 1e-9 * reach
+    # One key for pair and place: pairs lie so far apart that no range meets two.
+    step = 8 * reach
+    low = soup.low[others, axis[other_row]] - lowest
+    wide = np.zeros(len(a))
+    np.maximum.at(wide, other_row, soup.high[others, axis[other_row]] - lowest - low)
+    key = other_row * step + low
+    order = np.argsort(key, kind="stable")
+    key = key[order]
+    start = soup.low[one, axis[row]] - lowest - wide[row] - slack
+    end = soup.high[one, axis[row]] - lowest + slack
+    first = np.searchsorted(key, row * step + start, "left")
+    many = np.searchsorted(key, row * step + end, "right") - first
+    return others[order], first, many
 
 
 def _portions(load: np.ndarray) -> Iterator[slice]:
