@@ -84,3 +84,27 @@ def destructible(meshes, pairs=(), middles=(), normals=()):
     )
     order = np.argsort(built.chunk_map)
     return Destructible(built.asset, tuple(meshes[i] for i in order))
+
+
+def vase(height=0.5, sections=24):
+    """Return a hollow vase, closed and watertight, as a trimesh object."""
+    import trimesh
+
+    outline = [
+        [0, 0],
+        [0.18, 0],
+        [0.28, 0.25],
+        [0.3, 0.45],
+        [0.2, 0.7],
+        [0.15, 0.85],
+        [0.19, 1],
+        [0.13, 1],
+        [0.09, 0.85],
+        [0.14, 0.7],
+        [0.24, 0.45],
+        [0.22, 0.25],
+        [0.14, 0.06],
+        [0, 0.06],
+    ]
+    profile = np.array(outline) * height
+    return trimesh.creation.revolve(profile, sections=sections)

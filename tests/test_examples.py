@@ -43,6 +43,35 @@ def test_which_brick(capsys, tmp_path):
     assert (tmp_path / "table.png").stat().st_size > 5000
 
 
+def test_break_a_vase(capsys, tmp_path):
+    actors = load("break_a_vase").main(tmp_path)
+    assert actors > 3
+    assert "48 shards" in capsys.readouterr().out
+    assert len(list(tmp_path.glob("vase*.png"))) == 3
+
+
+def test_aim_a_shot(capsys, tmp_path):
+    aimed, _ = load("aim_a_shot").main(tmp_path / "aim.png", rounds=3)
+    assert aimed == 0
+    assert "free exactly 18 of 256" in capsys.readouterr().out
+    assert (tmp_path / "aim.png").stat().st_size > 5000
+
+
+def test_how_strong(capsys, tmp_path):
+    picture = tmp_path / "strength.png"
+    seen, new, guess = load("how_strong").main(picture, count=8, steps=200)
+    assert seen > 0.9 and new > guess
+    assert "all bricks alike" in capsys.readouterr().out
+    assert picture.stat().st_size > 5000
+
+
+@pytest.mark.slow
+def test_soft_landing(capsys, tmp_path):
+    before, after, pieces = load("soft_landing").main(tmp_path / "landing.png")
+    assert before > 1 > after and pieces == 1
+    assert "first throw" in capsys.readouterr().out
+
+
 def test_size_a_beam(capsys):
     after = load("size_a_beam").main(length=4, steps=40)
     np.testing.assert_allclose(after, 2.0, rtol=0.01)

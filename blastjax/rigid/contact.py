@@ -143,6 +143,22 @@ def collide(
     return data, Found(riders=carried, overlap=overlap, dropped=dropped)
 
 
+def make_data(scene: Scene) -> mjx.Data:
+    """Return data at the model's start, with room for what the colliders find."""
+    model = scene.model
+    data = mjx.make_data(model, impl="jax")
+    if data._impl.ncon == 0:
+        return data
+    cap = engine.numeric(model, "max_geom_pairs")
+    counts: dict[int, int] = {}
+    for group, _ in engine.contact_groups(model, data):
+        for rows, collider in _colliders(scene, group):
+            pairs = len(rows) if group.types[0] in _ENDLESS else min(len(rows), cap)
+            counts[group.condim] = counts.get(group.condim, 0) + pairs * collider.count
+    limit = engine.numeric(model, "max_contact_points")
+    return engine.make_data(model, {c: min(n, limit) for c, n in counts.items()})
+
+
 def _colliders(scene: Scene, group: engine.Group) -> list[tuple[np.ndarray, Collider]]:
     """Return which rows of a group collide by what."""
     chunk = scene.host.geom_element[group.pair] >= 0

@@ -122,6 +122,36 @@ def contact_groups(model: mjx.Model, data: mjx.Data) -> list[tuple[Group, mjx.Co
     return found
 
 
+def make_data(model: mjx.Model, contacts: dict[int, int]) -> mjx.Data:
+    """Return data at the model's start, with so many contacts of each dimension.
+
+    MJX counts those that its own colliders find; ours may find more or fewer.
+    """
+    data = mjx.make_data(model, impl="jax")
+    impl = data._impl
+    dim = np.array([c for c in sorted(contacts) for _ in range(contacts[c])], int)
+    if np.array_equal(dim, impl.contact.dim):
+        return data
+    kind = constraint.make_efc_type(model, dim)
+    rows, count = kind.size, dim.size
+
+    def sized(x: jax.Array, length: int) -> jax.Array:
+        return jnp.zeros((length, *x.shape[1:]), x.dtype)
+
+    touch = jax.tree.map(lambda x: sized(x, count), impl.contact)
+    touch = touch.replace(
+        dim=dim,
+        efc_address=constraint.make_efc_address(model, dim, kind),
+    )
+    names = [f.name for f in dataclasses.fields(impl) if f.name.startswith("efc_")]
+    arrays = [n for n in names if isinstance(getattr(impl, n), jax.Array)]
+    changed = {f"_impl.{n}": sized(getattr(impl, n), rows) for n in arrays}
+    changed |= {"_impl.contact": touch, "_impl.efc_type": kind}
+    return data.tree_replace(
+        {**changed, "_impl.nefc": int(rows), "_impl.ncon": int(count)}
+    )
+
+
 def _with_key(
     collider: Callable[..., Points], key: collision_driver.FunctionKey
 ) -> Callable[[mjx.Model, mjx.Data, jax.Array], Points]:
