@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from blastjax import author
-from blastjax.author import bonds, clip, solids
+from blastjax.author import bonds, clip, cut, solids
 from blastjax.author.overlap import box_pairs
 from blastjax.core import WORLD
 
@@ -46,6 +46,9 @@ def test_joint_is_bonded_midway_within_the_gap():
     np.testing.assert_allclose(found.area, [3.0])
     np.testing.assert_allclose(found.normal, [[1, 0, 0]])
     np.testing.assert_allclose(found.centroid, [[1.05, 0.25, 0]], atol=1e-12)
+    # Boxes that overlap at their edges, of which no faces look at each other.
+    aside = solids.box(np.array([1.95, 1.95, 0]), np.ones(3))
+    assert not len(bonds.between([one, aside], gap=0.02).area)
     # As deep may they overlap.
     deep = solids.box(np.array([1.95, 0, 0]), np.ones(3))
     np.testing.assert_allclose(bonds.between([one, deep], gap=0.1).area, [4.0])
@@ -110,6 +113,19 @@ def test_shared_area_of_triangles_against_sampling():
         if both.mean() > 0.01:
             np.testing.assert_allclose(centroid[k, :2], grid[both].mean(0), atol=5e-3)
     assert (area > 0.01).sum() > 8
+
+
+def test_bonds_of_a_cut_are_found_again_from_its_meshes():
+    pytest.importorskip("manifold3d")
+    trimesh = pytest.importorskip("trimesh")
+    tree = cut.solid(trimesh.creation.torus(1.0, 0.35))
+    whole = cut.destructible(cut.voronoi(tree, cut.uniform(tree, 24))).destructible
+    leaf = np.flatnonzero(np.asarray(whole.asset.chunk_children) == 0)
+    found = bonds.between([whole.meshes[i] for i in leaf])
+    found = author.Bonds(leaf[found.chunks], found.normal, found.area, found.centroid)
+    wanted = author.describe(whole.asset)[1]
+    for a, b in zip(sorted_bonds(found), sorted_bonds(wanted), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6)
 
 
 def test_bonds_to_the_world():

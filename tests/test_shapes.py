@@ -15,6 +15,7 @@ SOLIDS = {
     "arch": (lambda: shapes.arch(), 11, 10, 2),
     "flat arch": (lambda: shapes.arch(rise=0.5, voussoirs=7), 7, 6, 2),
     "free arch": (lambda: shapes.arch(voussoirs=4, anchor=False), 4, 3, 0),
+    "one stone": (lambda: shapes.arch(rise=0.5, voussoirs=1), 1, 0, 1),
     "dome": (lambda: shapes.dome(rings=3, segments=8), 25, 24 + 16 + 8, 8),
     "oculus": (lambda: shapes.dome(rings=2, segments=6, oculus=True), 12, 12 + 6, 6),
     "column": (lambda: shapes.column(drums=4), 4, 3, 1),

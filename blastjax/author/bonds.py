@@ -8,22 +8,22 @@ ones, or of pieces with a joint between them, their averaged mid-plane.
 The gap must be smaller than half the thinnest piece, or its far side counts too.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from blastjax.author import clip
 from blastjax.author.descriptions import Bonds, integers, reals, refuse
+from blastjax.author.facing import Soup, edges, normals, pairs_of
 from blastjax.author.mesh import Mesh
-from blastjax.author.overlap import box_pairs, ranges
+from blastjax.author.overlap import box_pairs
 from blastjax.core import WORLD
 
 FACING = np.cos(np.radians(20.0))
 """Least cosine between one face's normal and the other's reversed, over a gap."""
 FLAT = np.cos(1e-3)
 """The same for faces that touch."""
-_AT_A_TIME = 200_000
 
 
 def between(
@@ -71,10 +71,10 @@ def between(
         if part.shape != (len(meshes),):
             raise ValueError(f"parts has shape {part.shape}; give one for each mesh")
         pairs = pairs[part[pairs[:, 0]] != part[pairs[:, 1]]]
-    soup = _Soup(corners, low, high)
+    soup = Soup(corners, low, high)
     rows = [
         (owner, *clip.shared(soup.corners[i], soup.corners[j], normal, gap), normal)
-        for owner, i, j, normal in _facing(soup, pairs, gap, facing)
+        for owner, i, j, normal in pairs_of(soup, pairs, gap, facing)
     ]
     if not rows:
         return Bonds.none()
@@ -106,7 +106,7 @@ def to_plane(
 
     def on_plane(corners: np.ndarray) -> np.ndarray:
         away = np.abs((corners - point) @ normal) <= gap
-        return corners[away.all(axis=1) & (_normals(corners) @ normal >= facing)]
+        return corners[away.all(axis=1) & (normals(corners) @ normal >= facing)]
 
     return _to_world(meshes, on_plane, normal)
 
@@ -157,7 +157,7 @@ def to_world(meshes: Sequence[Mesh], pieces: Any, normal: Any = (0, 0, -1)) -> B
     direction = _unit("normal", normal)
 
     def seen(corners: np.ndarray) -> np.ndarray:
-        return corners[_normals(corners) @ direction > 1e-9]
+        return corners[normals(corners) @ direction > 1e-9]
 
     found = _to_world([meshes[i] for i in listed], seen, direction, project=True)
     pairs = np.stack([listed[found.chunks[:, 0]], found.chunks[:, 1]], axis=1)
@@ -172,74 +172,30 @@ def together(*bonds: Bonds) -> Bonds:
     return Bonds(*(np.concatenate([getattr(b, f) for b in bonds]) for f in fields))
 
 
-class _Soup:
-    """All triangles of all pieces, those of one piece together. T in all."""
+def summed(bonds: Bonds) -> tuple[Bonds, np.ndarray]:
+    """Sum up the bonds of each pair, the lower chunk first and the world last.
 
-    def __init__(self, corners: list[np.ndarray], low: np.ndarray, high: np.ndarray):
-        self.corners = np.concatenate(corners)
-        """(T, 3, 3) m."""
-        self.normal = _normals(self.corners)
-        """(T, 3) unit."""
-        self.low, self.high = self.corners.min(axis=1), self.corners.max(axis=1)
-        """(T, 3) bounds, m."""
-        self.count = np.array([len(c) for c in corners])
-        """(pieces,) triangles of each."""
-        self.start = np.cumsum(self.count) - self.count
-        """(pieces,) the first of them."""
-        self.piece_low, self.piece_high = low, high
-        """(pieces, 3) bounds, m."""
-
-    def near(
-        self, piece: np.ndarray, other: np.ndarray, gap: float
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the triangles of pieces (P,) near others (P,), and whose they are."""
-        row = np.repeat(np.arange(len(piece)), self.count[piece])
-        triangle = ranges(self.start[piece], self.count[piece])
-        meets = self.low[triangle] <= self.piece_high[other][row] + gap
-        meets &= self.high[triangle] >= self.piece_low[other][row] - gap
-        meets = meets.all(axis=1)
-        return triangle[meets], row[meets]
-
-
-def _facing(
-    soup: _Soup, pairs: np.ndarray, gap: float, facing: float
-) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
-    """Yield pair, triangle, triangle and mean normal of what look at each other."""
-    for some in _portions(soup.count[pairs].sum(axis=1)):
-        one, row = soup.near(pairs[some, 0], pairs[some, 1], gap)
-        others, other_row = soup.near(pairs[some, 1], pairs[some, 0], gap)
-        many = np.bincount(other_row, minlength=some.stop - some.start)
-        first = np.cumsum(many) - many
-        for part in _portions(many[row]):
-            times = many[row[part]]
-            i = np.repeat(one[part], times)
-            j = others[ranges(first[row[part]], times)]
-            owner = np.repeat(row[part], times) + some.start
-            keep, normal = _look(soup, i, j, gap, facing)
-            yield owner[keep], i[keep], j[keep], normal
-
-
-def _portions(load: np.ndarray) -> Iterator[slice]:
-    """Yield slices of rows whose loads sum up to about what fits in memory."""
-    total, start = np.cumsum(load), 0
-    while start < len(load):
-        before = total[start - 1] if start else 0
-        stop = int(np.searchsorted(total, before + _AT_A_TIME, "right"))
-        stop = max(stop, start + 1)
-        yield slice(start, stop)
-        start = stop
-
-
-def _look(
-    soup: _Soup, i: np.ndarray, j: np.ndarray, gap: float, facing: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return which triangles look at each other within the gap, and mean normals."""
-    apart = np.maximum(soup.low[i] - soup.high[j], soup.low[j] - soup.high[i])
-    keep = np.flatnonzero((apart <= gap).all(axis=1))
-    cosine = -np.einsum("ki,ki->k", soup.normal[i[keep]], soup.normal[j[keep]])
-    keep = keep[cosine >= facing]
-    normal = soup.normal[i[keep]] - soup.normal[j[keep]]
-    return keep, normal / np.linalg.norm(normal, axis=1, keepdims=True)
+    Returns:
+      The bonds, with total area and area-weighted centroid and normal, and (their
+      number,) the first of the bonds that each was made of.
+    """
+    rank = np.where(bonds.chunks == WORLD, np.iinfo(np.int64).max, bonds.chunks)
+    turned = rank[:, 0] > rank[:, 1]
+    pairs = np.where(turned[:, None], bonds.chunks[:, ::-1], bonds.chunks)
+    normal = np.where(turned[:, None], -bonds.normal, bonds.normal)
+    _, first, place = np.unique(pairs, axis=0, return_index=True, return_inverse=True)
+    place, number = place.reshape(-1), len(first)
+    area = np.bincount(place, bonds.area, number)
+    vector, middle = np.zeros((number, 3)), np.zeros((number, 3))
+    np.add.at(vector, place, bonds.area[:, None] * normal)
+    np.add.at(middle, place, bonds.area[:, None] * bonds.centroid)
+    length = np.linalg.norm(vector, axis=1)
+    # Where areas or normals cancel out, the first bond speaks for all.
+    vector = np.where((length > 0)[:, None], vector, normal[first])
+    middle = middle / np.where(area > 0, area, 1)[:, None]
+    middle = np.where((area > 0)[:, None], middle, bonds.centroid[first])
+    length = np.where(length > 0, length, 1)[:, None]
+    return Bonds(pairs[first], vector / length, area, middle), first
 
 
 def _summed(
@@ -278,7 +234,7 @@ def _to_world(
         length = float(np.linalg.norm(mean))
         if (
             area.sum()
-            <= 1e-12 * np.linalg.norm(np.cross(*_edges(corners)), axis=1).sum()
+            <= 1e-12 * np.linalg.norm(np.cross(*edges(corners)), axis=1).sum()
         ):
             continue
         if project or length <= 1e-6 * area.sum():
@@ -293,17 +249,6 @@ def _to_world(
     pieces, normals, areas, places = zip(*rows, strict=True)
     pairs = np.stack([pieces, np.full(len(pieces), WORLD)], axis=1)
     return Bonds(pairs, np.array(normals), np.array(areas), np.array(places))
-
-
-def _edges(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-
-
-def _normals(corners: np.ndarray) -> np.ndarray:
-    """Return unit normals, zero where a triangle has no area."""
-    cross = np.cross(*_edges(corners))
-    length = np.linalg.norm(cross, axis=1, keepdims=True)
-    return cross / np.where(length > 0, length, 1.0)
 
 
 def _bounds(corners: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:

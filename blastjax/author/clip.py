@@ -21,7 +21,7 @@ def by_plane(polygon: np.ndarray, height: np.ndarray) -> np.ndarray:
       (K, M + 1, D): a cut through a convex polygon adds one corner at most. Where
       nothing is left, all corners are one point.
     """
-    count, corners, _ = polygon.shape
+    count, corners, axes = polygon.shape
     # Corners on the plane to within rounding are inside: if some of them were not, an
     # edge along the plane could cross it more than once.
     inside = height <= ROUNDING * np.abs(height).max(axis=1, keepdims=True)
@@ -30,7 +30,7 @@ def by_plane(polygon: np.ndarray, height: np.ndarray) -> np.ndarray:
     rise = np.where(crosses, beyond - height, 1.0)
     share = np.where(crosses, np.clip(-height / rise, 0, 1), 0.0)[..., None]
     crossing = polygon + share * (following - polygon)
-    points = np.stack([polygon, crossing], axis=2).reshape(count, 2 * corners, -1)
+    points = np.stack([polygon, crossing], axis=2).reshape(count, 2 * corners, axes)
     real = np.stack([inside, crosses], axis=2).reshape(count, 2 * corners)
     order = np.argsort(~real, axis=1, kind="stable")[:, : corners + 1]
     last = np.maximum(real.sum(axis=1) - 1, 0)

@@ -1,11 +1,8 @@
-"""Groups of neighbours in a graph, and bonds of the same pair made one. Plain numpy."""
+"""Groups of neighbours in a graph. Plain numpy."""
 
 import heapq
 
 import numpy as np
-
-from blastjax.author.descriptions import Bonds
-from blastjax.core import WORLD
 
 
 def grow(
@@ -82,29 +79,3 @@ def _grow_part(
         if free:
             take(max(free, key=lambda p: (free[p], -p)), k)
             heapq.heappush(waiting, (count + 1, k))
-
-
-def merge_pairs(bonds: Bonds) -> tuple[Bonds, np.ndarray]:
-    """Sum up the bonds of each pair, the lower chunk first and the world last.
-
-    Returns:
-      The bonds, with total area and area-weighted centroid and normal, and (their
-      number,) the first of the bonds that each was made of.
-    """
-    rank = np.where(bonds.chunks == WORLD, np.iinfo(np.int64).max, bonds.chunks)
-    turned = rank[:, 0] > rank[:, 1]
-    pairs = np.where(turned[:, None], bonds.chunks[:, ::-1], bonds.chunks)
-    normal = np.where(turned[:, None], -bonds.normal, bonds.normal)
-    _, first, place = np.unique(pairs, axis=0, return_index=True, return_inverse=True)
-    place, number = place.reshape(-1), len(first)
-    area = np.bincount(place, bonds.area, number)
-    vector, middle = np.zeros((number, 3)), np.zeros((number, 3))
-    np.add.at(vector, place, bonds.area[:, None] * normal)
-    np.add.at(middle, place, bonds.area[:, None] * bonds.centroid)
-    length = np.linalg.norm(vector, axis=1)
-    # Where areas or normals cancel out, the first bond speaks for all.
-    vector = np.where((length > 0)[:, None], vector, normal[first])
-    middle = middle / np.where(area > 0, area, 1)[:, None]
-    middle = np.where((area > 0)[:, None], middle, bonds.centroid[first])
-    length = np.where(length > 0, length, 1)[:, None]
-    return Bonds(pairs[first], vector / length, area, middle), first

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from blastjax.author import bonds as find
 from blastjax.author import cluster
 from blastjax.author.assembly import (
     Result,
@@ -117,7 +118,7 @@ def delete(whole: Whole, chunks: Any, *, itself: bool = False) -> Result:
     ends = np.where(bonds.chunks == WORLD, WORLD, name[bonds.chunks])
     stay = ((ends != NONE) | (bonds.chunks == WORLD)).all(axis=1)
     stay &= ends[:, 0] != ends[:, 1]
-    rows, first = cluster.merge_pairs(_rows(bonds, stay, ends))
+    rows, first = find.summed(_rows(bonds, stay, ends))
     result = rebuilt(
         whole, kept, rows, [m for m, g in zip(meshes, gone, strict=False) if not g]
     )

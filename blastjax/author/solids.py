@@ -115,11 +115,12 @@ def assemble(
     Args:
       meshes: one a chunk.
       bonds: between them; None finds those of faces that touch.
-      world: bonds to the world.
+      world: bonds to the world; those of one piece are summed up.
       dtype: see `author.build`.
     """
     bonds = find.between(meshes) if bonds is None else bonds
-    built = build(describe(meshes), find.together(bonds, *world), dtype=dtype)
+    held, _ = find.summed(find.together(Bonds.none(), *world))
+    built = build(describe(meshes), find.together(bonds, held), dtype=dtype)
     return Destructible(built.asset, in_order(built, meshes))
 
 

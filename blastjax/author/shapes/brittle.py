@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 from blastjax.author import bonds, cut, solids
-from blastjax.author.descriptions import reals
+from blastjax.author.descriptions import Bonds, reals
 from blastjax.author.mesh import Destructible
 from blastjax.author.shapes.boxes import SIDES, counts
-from blastjax.author.shapes.vaults import positive
+from blastjax.author.shapes.vaults import DOWN, positive
 
 VASE = (
     *((0.05, 0.0), (0.09, 0.08), (0.1, 0.16)),
@@ -61,13 +61,13 @@ def pane(
     else:
         flat = _around(reals("impact", impact, (2,)), number, width, height, rng)
     sites = np.stack([flat[:, 0], np.zeros(number), flat[:, 1]], axis=1)
-    tree = cut.voronoi(tree, sites)
-    world = []
+    tree, held = cut.voronoi(tree, sites), [Bonds.none()]
     for side in anchor:
         normal = (1.0 if side[1] == "+" else -1.0) * np.eye(3)["xyz".index(side[0])]
-        world.append(bonds.to_plane(tree.meshes, middle + normal * half, normal))
-    found = cut.destructible(tree, world=world, dtype=dtype)
-    return found.destructible
+        held.append(bonds.to_plane(tree.meshes, middle + normal * half, normal))
+    # A shard in a corner is held by both edges: one bond, for there is one world.
+    world = [bonds.summed(bonds.together(*held))[0]]
+    return cut.destructible(tree, world=world, dtype=dtype).destructible
 
 
 def vase(
@@ -113,10 +113,10 @@ def vase(
     )
     trimesh = importlib.import_module("trimesh")
     tree = cut.solid(trimesh.creation.revolve(outline, sections=sides))
-    tree = cut.voronoi(tree, cut.uniform(tree, number, seed=seed))
-    world = [bonds.to_plane(tree.meshes, (0, 0, foot), (0, 0, -1))] if anchor else ()
-    found = cut.destructible(tree, world=world, dtype=dtype)
-    return found.destructible
+    sites = cut.uniform(tree, number, seed=seed)
+    tree = cut.voronoi(tree, sites)
+    held = [bonds.to_plane(tree.meshes, (0, 0, foot), DOWN)] if anchor else []
+    return cut.destructible(tree, world=held, dtype=dtype).destructible
 
 
 def _around(
