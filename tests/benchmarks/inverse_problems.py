@@ -153,7 +153,7 @@ def by_margin(problem):
     """Return a solver: Adam on the margin loss from several starts at once."""
     optimizer = optax.adam(problem.rate)
     pace = jnp.asarray(np.geomspace(1.5, 0.2, problem.lanes), jnp.float32)
-    slope = gradient or jax.grad(functools.partial(margin_loss, problem), has_aux=True)
+    slope = jax.grad(functools.partial(margin_loss, problem), has_aux=True)
 
     @jax.jit
     def advance(lanes, known, target):
