@@ -244,7 +244,11 @@ def _summary(value: jax.Array, gradient: Any) -> Expectation:
     """Average samples (K, ...) and say how sure the averages are."""
 
     def error(x: jax.Array) -> jax.Array:
-        return jnp.std(x, axis=0, ddof=1) / math.sqrt(x.shape[0])
+        square = jnp.var(x, axis=0, ddof=1)
+        # Equal samples: the root of zero has no derivative to pass on.
+        varies = square > 0
+        root = jnp.where(varies, jnp.sqrt(jnp.where(varies, square, 1)), 0)
+        return root / math.sqrt(x.shape[0])
 
     return Expectation(
         value=jnp.mean(value),

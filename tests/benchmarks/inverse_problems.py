@@ -25,6 +25,8 @@ from blastjax.core import Damage
 
 STEPS_A_CALL = 25
 """Steps between looks at the clock."""
+CALLS_A_START = 16
+"""Calls after which descent starts anew elsewhere."""
 
 
 class Aiming:
@@ -147,13 +149,14 @@ def margin_loss(problem, parameters, known, target):
     return jnp.sum(jax.vmap(one)(found, target)), right
 
 
-def by_margin(problem, gradient=None):
+def by_margin(problem):
     """Return a solver: Adam on the margin loss from several starts at once."""
     optimizer = optax.adam(problem.rate)
-    slope = gradient or jax.grad(functools.partial(margin_loss, problem), has_aux=True)
+    pace = jnp.asarray(np.geomspace(1.5, 0.2, problem.lanes), jnp.float32)
+    slope = jax.grad(functools.partial(margin_loss, problem), has_aux=True)
 
     @jax.jit
-    def advance(lanes, key, known, target):
+    def advance(lanes, known, target):
         def running(carry):
             count, _, _, _, solved = carry
             return (count < STEPS_A_CALL) & ~jnp.any(solved)
@@ -162,6 +165,8 @@ def by_margin(problem, gradient=None):
             count, values, memory, best, _ = carry
             grads, right = jax.vmap(slope, (0, None, None))(values, known, target)
             change, memory = jax.vmap(optimizer.update)(grads, memory)
+            # Long strides get there, short ones settle: lanes differ.
+            change = change * pace[:, None]
             best = jnp.where(right[:, None], values, best)
             return count + 1, optax.apply_updates(values, change), memory, best, right
 
@@ -174,14 +179,19 @@ def by_margin(problem, gradient=None):
 
     def solve(known, target, guess, seconds, seed):
         rng = np.random.default_rng(seed)
-        spread = rng.normal(size=(problem.lanes, guess.size)) * problem.sigma
-        spread[0] = 0
-        values = jnp.asarray(guess[None] + spread, jnp.float32)
-        lanes = values, jax.vmap(optimizer.init)(values)
-        key, began, calls = jax.random.key(seed), time.perf_counter(), 0
+
+        def begin(first):
+            off = rng.normal(size=(problem.lanes, guess.size)) * problem.sigma
+            off[0] *= not first
+            values = jnp.asarray(guess[None] + off, jnp.float32)
+            return values, jax.vmap(optimizer.init)(values)
+
+        began, calls, lanes = time.perf_counter(), 0, begin(True)
         while time.perf_counter() - began < seconds:
-            lanes, best, solved = advance(lanes, key, known, target)
+            lanes, best, solved = advance(lanes, known, target)
             calls += 1
+            if calls % CALLS_A_START == 0:
+                lanes = begin(False)
             if bool(solved.any()):
                 return np.asarray(best)[
                     int(solved.argmax())
