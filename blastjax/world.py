@@ -145,6 +145,8 @@ def init(
       velocity: (3,) of the rest frame's origin, m/s; the world's part stays still.
       spin: (3,) angular velocity in world axes, rad/s.
       remove_dead: see `step`.
+
+    Differentiable in healths, velocity and spin.
     """
     if state is None:
         state = fracture.init(scene.asset, bond_health, chunk_health)
@@ -211,6 +213,10 @@ def step(
     Returns:
       The world and what happened. Without damage, impact and stress nothing can break,
       and nothing of fracture is in the program.
+
+    Differentiable, forward and reverse, through contact (by the implicit function
+    theorem), friction and damage. Misses the jumps: contacts that begin or end within
+    the step, bonds that break, actors that part, what the caps leave out.
     """
     riding, data = world.bodies, world.data
     data = data if ctrl is None else data.replace(ctrl=ctrl)
@@ -322,6 +328,8 @@ def impact_damage(
       Damage: for each bond, and each chunk that is an actor by itself, the sum over all
       contacts on its actor, each weighted by the falloff of the distance in the rest
       frame. Every contact counts, there is no cap.
+
+    Differentiable in forces, places and how contacts hurt.
     """
     asset, state, touch = scene.asset, world.state, world.data._impl.contact
     excess = jnp.maximum(force - impact.threshold, 0.0)
@@ -367,6 +375,9 @@ def bear(
       frames: of the slots when the contacts were found.
       carried: what carried each geom then.
       stress: how loads hurt.
+
+    Differentiable in loads, by the implicit function theorem; the grouping into
+    actors is constant.
     """
     asset, none = scene.asset, jnp.zeros_like(node_place(scene.asset))
     load = Load(force=none, torque=none)
@@ -387,7 +398,10 @@ def bear(
 
 
 def held_weight(scene: Scene, state: State, mass: jax.Array) -> Load:
-    """Return the weight (N,) of what the world holds, in the rest frame."""
+    """Return the weight (N,) of what the world holds, in the rest frame.
+
+    Differentiable in mass and gravity; what is held is constant.
+    """
     held = state.actor[: mass.shape[0]] == 0
     back = spatial.conjugate(scene.quaternion)
     down = spatial.rotate(scene.model.opt.gravity.astype(mass.dtype), back)
@@ -400,6 +414,8 @@ def contact_load(
     """Return the contact forces on the nodes, each in its actor's rest frame.
 
     Chunks below the support level have no bonds, and no load.
+
+    Differentiable in forces and places of contacts.
     """
     place = node_place(scene.asset)
     num_nodes, touch = place.shape[0], data._impl.contact

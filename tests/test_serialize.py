@@ -1,5 +1,6 @@
 """Files: round trips, damage, foreign files, and content that cannot be."""
 
+import dataclasses
 import io
 import json
 import pathlib
@@ -12,9 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from blastjax import author, damage, fracture, serialize
+from blastjax import author, consistency, fracture, serialize
 from blastjax.author.mesh import Destructible, Mesh
 from blastjax.consistency import refuse_asset, refuse_meshes, refuse_state
+from blastjax.core import Asset, State
 
 CUBE = Mesh(
     np.array([[x, y, z] for x in (0, 1.0) for y in (0, 1.0) for z in (0, 1.0)]),
@@ -38,12 +40,14 @@ def padded():
 
 
 def broken(asset):
-    state = fracture.init(asset, 1.0)
-    where = np.asarray(asset.chunk_centroid[-1])
-    state, _ = fracture.apply(
-        asset, state, damage.falloff(asset, state, where, 9, 1, 2)
+    """A state with healths of all kinds, and its last node an actor of its own."""
+    state = fracture.init(asset, jnp.arange(1.0, 1 + len(asset.bond_area)))
+    chunk = np.asarray(asset.element_chunk[: len(state.dirty)])
+    last = int(np.flatnonzero(chunk >= 0)[-1])
+    cut = jnp.any(asset.bond_nodes == last, axis=1)
+    return state.replace(
+        actor=state.actor.at[last].set(last), bond_intact=state.bond_intact & ~cut
     )
-    return fracture.split(asset, state)[0]
 
 
 def same(one, other):
@@ -81,6 +85,16 @@ def test_meshes_come_back(tmp_path):
         assert mesh.faces.dtype == old.faces.dtype
     assert found.meshes[0].interior is None
     np.testing.assert_array_equal(found.meshes[1].interior, inner.interior)
+
+
+def test_a_shape_with_meshes_and_levels_comes_back(tmp_path):
+    arch = author.unite(author.shapes.arch(voussoirs=6), 3).whole
+    path = serialize.save(tmp_path / "a.npz", arch)
+    found = serialize.load(path).destructible
+    assert same(found.asset, arch.asset)
+    for mesh, old in zip(found.meshes, arch.meshes, strict=True):
+        np.testing.assert_array_equal(mesh.vertices, old.vertices)
+        np.testing.assert_array_equal(mesh.faces, old.faces)
 
 
 def test_damaged_files_are_refused_or_load_the_same(tmp_path):
@@ -272,3 +286,12 @@ def test_inconsistent_meshes_are_refused():
     ]:
         with pytest.raises(ValueError, match=message):
             refuse_meshes([mesh])
+
+
+def test_every_field_has_a_shape():
+    for kind, shapes in (
+        (Asset, consistency._ASSET_SHAPES),
+        (State, consistency._STATE_SHAPES),
+    ):
+        fields = dataclasses.fields(kind)
+        assert set(shapes) == {f.name for f in fields if not f.metadata.get("static")}

@@ -8,7 +8,7 @@ ones, or of pieces with a joint between them, their averaged mid-plane.
 The gap must be smaller than half the thinnest piece, or its far side counts too.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ import numpy as np
 from blastjax.author import clip
 from blastjax.author.descriptions import Bonds, integers, reals, refuse
 from blastjax.author.mesh import Mesh
-from blastjax.author.overlap import box_pairs
+from blastjax.author.overlap import box_pairs, ranges
 from blastjax.core import WORLD
 
 FACING = np.cos(np.radians(20.0))
@@ -71,26 +71,15 @@ def between(
         if part.shape != (len(meshes),):
             raise ValueError(f"parts has shape {part.shape}; give one for each mesh")
         pairs = pairs[part[pairs[:, 0]] != part[pairs[:, 1]]]
-    normals = [_normals(c) for c in corners]
+    soup = _Soup(corners, low, high)
     rows = [
-        _facing(corners, normals, a, b, low, high, gap, facing, row)
-        for row, (a, b) in enumerate(pairs.tolist())
+        (owner, *clip.shared(soup.corners[i], soup.corners[j], normal, gap), normal)
+        for owner, i, j, normal in _facing(soup, pairs, gap, facing)
     ]
-    owner, one, other, normal = (
-        np.concatenate(x) if x else np.zeros((0, *shape))
-        for x, shape in zip(
-            list(zip(*rows, strict=True)) or [()] * 4,
-            [(), (3, 3), (3, 3), (3,)],
-            strict=True,
-        )
-    )
-    area, centroid = np.zeros(len(one)), np.zeros((len(one), 3))
-    for start in range(0, len(one), _AT_A_TIME):
-        some = slice(start, start + _AT_A_TIME)
-        area[some], centroid[some] = clip.shared(
-            one[some], other[some], normal[some], gap
-        )
-    return _summed(pairs, owner.astype(int), area, centroid, normal, least)
+    if not rows:
+        return Bonds.none()
+    owner, area, centroid, normal = (np.concatenate(x) for x in zip(*rows, strict=True))
+    return _summed(pairs, owner, area, centroid, normal, least)
 
 
 def to_plane(
@@ -183,45 +172,74 @@ def together(*bonds: Bonds) -> Bonds:
     return Bonds(*(np.concatenate([getattr(b, f) for b in bonds]) for f in fields))
 
 
+class _Soup:
+    """All triangles of all pieces, those of one piece together. T in all."""
+
+    def __init__(self, corners: list[np.ndarray], low: np.ndarray, high: np.ndarray):
+        self.corners = np.concatenate(corners)
+        """(T, 3, 3) m."""
+        self.normal = _normals(self.corners)
+        """(T, 3) unit."""
+        self.low, self.high = self.corners.min(axis=1), self.corners.max(axis=1)
+        """(T, 3) bounds, m."""
+        self.count = np.array([len(c) for c in corners])
+        """(pieces,) triangles of each."""
+        self.start = np.cumsum(self.count) - self.count
+        """(pieces,) the first of them."""
+        self.piece_low, self.piece_high = low, high
+        """(pieces, 3) bounds, m."""
+
+    def near(
+        self, piece: np.ndarray, other: np.ndarray, gap: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the triangles of pieces (P,) near others (P,), and whose they are."""
+        row = np.repeat(np.arange(len(piece)), self.count[piece])
+        triangle = ranges(self.start[piece], self.count[piece])
+        meets = self.low[triangle] <= self.piece_high[other][row] + gap
+        meets &= self.high[triangle] >= self.piece_low[other][row] - gap
+        meets = meets.all(axis=1)
+        return triangle[meets], row[meets]
+
+
 def _facing(
-    corners: list[np.ndarray],
-    normals: list[np.ndarray],
-    a: int,
-    b: int,
-    low: np.ndarray,
-    high: np.ndarray,
-    gap: float,
-    facing: float,
-    row: int,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the pairs of triangles of two pieces that look at each other."""
-    i, j = (
-        _near(corners[a], low[b], high[b], gap),
-        _near(corners[b], low[a], high[a], gap),
-    )
-    met = -(normals[a][i] @ normals[b][j].T) >= facing
-    p, q = np.nonzero(met)
-    i, j = i[p], j[q]
-    one, other = corners[a][i], corners[b][j]
-    apart = np.maximum(one.min(axis=1) - other.max(axis=1), 0)
-    apart = np.maximum(apart, other.min(axis=1) - one.max(axis=1))
-    normal = normals[a][i] - normals[b][j]
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    # Planes that stand apart by more than the gap everywhere cannot be bonded.
-    off = np.einsum("kmi,ki->km", other, normal)
-    mine = np.einsum("kmi,ki->km", one, normal)
-    wide = (off.min(axis=1) - mine.max(axis=1) > gap) | (
-        mine.min(axis=1) - off.max(axis=1) > gap
-    )
-    keep = ~wide & (apart <= gap).all(axis=1)
-    return np.full(keep.sum(), row), one[keep], other[keep], normal[keep]
+    soup: _Soup, pairs: np.ndarray, gap: float, facing: float
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
+    """Yield pair, triangle, triangle and mean normal of what look at each other."""
+    for some in _portions(soup.count[pairs].sum(axis=1)):
+        one, row = soup.near(pairs[some, 0], pairs[some, 1], gap)
+        others, other_row = soup.near(pairs[some, 1], pairs[some, 0], gap)
+        many = np.bincount(other_row, minlength=some.stop - some.start)
+        first = np.cumsum(many) - many
+        for part in _portions(many[row]):
+            times = many[row[part]]
+            i = np.repeat(one[part], times)
+            j = others[ranges(first[row[part]], times)]
+            owner = np.repeat(row[part], times) + some.start
+            keep, normal = _look(soup, i, j, gap, facing)
+            yield owner[keep], i[keep], j[keep], normal
 
 
-def _near(
-    corners: np.ndarray, low: np.ndarray, high: np.ndarray, gap: float
-) -> np.ndarray:
-    meets = (corners.min(axis=1) <= high + gap) & (corners.max(axis=1) >= low - gap)
-    return np.flatnonzero(meets.all(axis=1))
+def _portions(load: np.ndarray) -> Iterator[slice]:
+    """Yield slices of rows whose loads sum up to about what fits in memory."""
+    total, start = np.cumsum(load), 0
+    while start < len(load):
+        before = total[start - 1] if start else 0
+        stop = int(np.searchsorted(total, before + _AT_A_TIME, "right"))
+        stop = max(stop, start + 1)
+        yield slice(start, stop)
+        start = stop
+
+
+def _look(
+    soup: _Soup, i: np.ndarray, j: np.ndarray, gap: float, facing: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return which triangles look at each other within the gap, and mean normals."""
+    apart = np.maximum(soup.low[i] - soup.high[j], soup.low[j] - soup.high[i])
+    keep = np.flatnonzero((apart <= gap).all(axis=1))
+    cosine = -np.einsum("ki,ki->k", soup.normal[i[keep]], soup.normal[j[keep]])
+    keep = keep[cosine >= facing]
+    normal = soup.normal[i[keep]] - soup.normal[j[keep]]
+    return keep, normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
 
 def _summed(

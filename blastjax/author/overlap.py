@@ -41,7 +41,7 @@ def box_pairs(low: np.ndarray, high: np.ndarray, gap: float = 0.0) -> np.ndarray
         first = np.searchsorted(ranked, near, "left")
         many = np.searchsorted(ranked, near, "right") - first
         a = np.repeat(np.arange(count), many)
-        b = order[_ranges(first, many)]
+        b = order[ranges(first, many)]
         meet = (a < b) & ((low[a] <= high[b] + gap) & (low[b] <= high[a] + gap)).all(
             axis=1
         )
@@ -50,7 +50,7 @@ def box_pairs(low: np.ndarray, high: np.ndarray, gap: float = 0.0) -> np.ndarray
     return pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
 
 
-def _ranges(first: np.ndarray, many: np.ndarray) -> np.ndarray:
+def ranges(first: np.ndarray, many: np.ndarray) -> np.ndarray:
     """Return first[i], ..., first[i] + many[i] - 1 for each i, in one row."""
     ends = np.cumsum(many)
     return np.arange(ends[-1] if len(ends) else 0) + np.repeat(

@@ -34,9 +34,9 @@ def options(parser: argparse.ArgumentParser) -> None:
     add("--asset", help="file of `fracture` to break instead of walls of bricks")
     add(
         "--collision",
-        choices=("box", "sphere", "hull"),
-        default="box",
-        help="as what chunks collide",
+        choices=("auto", "box", "sphere", "hull"),
+        default="auto",
+        help="as what chunks collide; auto takes hulls where there are meshes",
     )
     add("--bricks", type=whole(1), default=5, help="whole bricks in a course")
     add("--courses", type=whole(1), default=5, help="courses of the wall")
@@ -121,18 +121,19 @@ def run(args: argparse.Namespace, parser: argparse.ArgumentParser) -> int:
 def _environment(args: argparse.Namespace) -> Any:
     with quiet():
         from blastjax import envs, serialize
+    collision = None if args.collision == "auto" else args.collision
     if not args.asset:
         return envs.Breach(
             bricks=args.bricks,
             courses=args.courses,
             slots=args.slots,
-            collision=args.collision,
+            collision=collision,
         )
     saved = serialize.load(args.asset)
     if saved.asset is None:
         raise ValueError(f"{args.asset} holds no asset")
     what = saved.asset if saved.meshes is None else saved.destructible
-    return envs.Breach(asset=what, slots=args.slots, collision=args.collision)
+    return envs.Breach(asset=what, slots=args.slots, collision=collision)
 
 
 def _shots(batch: int, key: jax.Array, seed: int) -> jax.Array:

@@ -131,7 +131,7 @@ class Breach(Env):
         config: Config | None = None,
         *,
         asset: Asset | Destructible | None = None,
-        collision: str = "box",
+        collision: str | None = None,
         **changes: Any,
     ) -> None:
         """Build the scene.
@@ -140,7 +140,8 @@ class Breach(Env):
           config: the settings; by default those of `Config`, or `fitted` to the asset.
           asset: stands there instead of the wall, moved so that the middle of its foot
             is the origin. It must be bonded to the world.
-          collision: how chunks collide, see `rigid.scene.build`.
+          collision: how chunks collide, see `rigid.scene.build`; None takes hulls of an
+            asset with meshes, else boxes.
           **changes: fields of the config to change.
 
         Raises:
@@ -159,9 +160,9 @@ class Breach(Env):
             low, high = _bounds(_bare(asset))
             position = -np.array([low[0] + high[0], low[1] + high[1], 2 * low[2]]) / 2
             self._low, self._high = low + position, high + position
-        # Boxes and balls need no meshes.
-        what: Any = asset if collision == "hull" else _bare(asset)
-        asset = _bare(asset)
+        if collision is None:
+            collision = "hull" if isinstance(asset, Destructible) else "box"
+        what, asset = asset, _bare(asset)
         _check(config, self._high[1])
         self.config = config
         self.scene = scene.build(

@@ -55,8 +55,9 @@ def resolve(
     posed = problem(scene, model, data, bodies, frames, carried)
     if posed.rows is None and not posed.contacts:
         free = data.replace(qacc=data.qacc_smooth)
-        nothing = jnp.zeros((), data.qacc.dtype)
-        return free, solver.Report(nothing, jnp.zeros((), jnp.int32))
+        # Nothing to solve, and nothing to hide: what is not finite stays so.
+        residual = 0.0 * jax.lax.stop_gradient(data.qacc_smooth).sum()
+        return free, solver.Report(residual, jnp.zeros((), jnp.int32))
     acceleration, forces, pull, report = solver.solve(
         posed,
         motion(scene, data.qacc_warmstart),

@@ -101,7 +101,8 @@ class Report(pytree.Node):
     """How a solution went: trouble is data."""
 
     residual: jax.Array
-    """() norm of the gradient over the trace of the inertia, m/s^2."""
+    """() norm of the gradient over the trace of the inertia, m/s^2; NaN where the
+    world is no longer finite."""
     iterations: jax.Array
     """() int32, Newton steps taken."""
 

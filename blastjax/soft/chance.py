@@ -48,6 +48,7 @@ def logistic(temperature: float | jax.Array = 0.1) -> Strength:
 
     A bond survives with probability sigmoid((health - damage) / temperature), whether
     it was hit or not. The temperature is the scale of the distribution, health.
+    Log odds are differentiable in health, damage and temperature.
     """
 
     def log_odds(health: jax.Array, damage: jax.Array) -> jax.Array:
@@ -61,14 +62,16 @@ def weibull(shape: float | jax.Array = 5.0) -> Strength:
 
     A bond survives with probability exp(-(damage gamma(1 + 1 / shape) / health)^shape);
     what was not hit survives. A high shape is a reliable material (ceramics 5 to 20).
-    Each event draws anew: that a bond withstood an earlier one is not remembered.
+    Each event draws anew: that a bond withstood an earlier one is not remembered. Log
+    odds are differentiable in health, damage and shape, where there is damage.
     """
 
     def log_odds(health: jax.Array, damage: jax.Array) -> jax.Array:
         power = jnp.asarray(shape, health.dtype)
         hit = (damage > 0) & (health > 0)
-        ratio = jnp.where(hit, damage, 1) / jnp.where(hit, health, 1)
-        scaled = jnp.log(ratio) + jax.scipy.special.gammaln(1 + 1 / power)
+        # No quotient: of a huge health it would be zero, and its logarithm infinite.
+        scaled = jnp.log(jnp.where(hit, damage, 1)) - jnp.log(jnp.where(hit, health, 1))
+        scaled = scaled + jax.scipy.special.gammaln(1 + 1 / power)
         # Beyond these the outcome is certain to more digits than any float has.
         log_hazard = jnp.clip(power * scaled, -60.0, 4.0)
         hazard = jnp.exp(jnp.maximum(log_hazard, -10.0))

@@ -49,6 +49,8 @@ def sources(asset: Asset, to: jax.Array | int | None) -> jax.Array:
       asset: the asset.
       to: () a node, (N,) bool a set of nodes, or None for the world.
 
+    Piecewise constant: no derivative passes.
+
     Raises:
       ValueError: the world is meant and the asset has none, or `to` has another shape.
     """

@@ -38,7 +38,7 @@ def thrown(dtype, cubes, chunk_contacts, tolerance):
     impact = world.Impact(
         threshold=10.0, hardness=100.0, min_radius=0.1, max_radius=1.0
     )
-    health = np.full(cubes - 1, 30.0).astype(dtype)
+    health = np.linspace(1.0, 4.0, cubes - 1).astype(dtype)
     start = world.init(scene, bond_health=health, velocity=(1.5, 0.3, -2.0))
     return scene, start, impact
 

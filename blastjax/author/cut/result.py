@@ -48,7 +48,8 @@ def destructible(
         only one. Leaves above that level are support chunks too. None takes all leaves.
       support: (P,) bool instead, which pieces are support chunks.
       world: bonds to the world or others, such as `author.bonds.to_plane(tree.meshes,
-        ...)`; those of pieces that are no support chunks are dropped.
+        ...)`; those of pieces that are no support chunks are dropped, several of one
+        pair made one of all their area.
       dtype: of the asset's real arrays, as in `author.build`.
 
     Raises:
@@ -61,13 +62,30 @@ def destructible(
     shared = _contacts(found, chosen, float((high - low).max()))
     own = Bonds(shared.pieces, shared.normal, shared.area, shared.centroid)
     chunks = solids.describe(meshes, np.array(tree.parent), chosen)
-    built = build(chunks, bonds.together(own, *world), dtype=dtype)
+    built = build(chunks, bonds.together(own, _united(world)), dtype=dtype)
     return Result(
         Destructible(built.asset, solids.in_order(built, meshes)),
         built,
         shared,
         tree.warnings,
     )
+
+
+def _united(found: Sequence[Bonds]) -> Bonds:
+    """Return bonds with one for each pair: a piece may touch the world on two sides."""
+    every = bonds.together(*found)
+    area = np.asarray(every.area, float)
+    pairs, place = np.unique(every.chunks, axis=0, return_inverse=True)
+    totals = np.zeros((len(pairs), 7))
+    rows = np.column_stack([area, area[:, None] * every.normal])
+    rows = np.column_stack([rows, area[:, None] * every.centroid])
+    np.add.at(totals, place.ravel(), rows)
+    length = np.linalg.norm(totals[:, 1:4], axis=1, keepdims=True)
+    # Held from two opposite sides a piece has no direction of its own.
+    upright = np.array([0.0, 0.0, 1.0])
+    normal = np.where(length > 0, totals[:, 1:4] / np.where(length > 0, length, 1), 0)
+    normal = np.where(length > 1e-6 * totals[:, :1], normal, upright)
+    return Bonds(pairs, normal, totals[:, 0], totals[:, 4:] / totals[:, :1])
 
 
 def _support(tree: Tree, level: int | None, support: Any) -> np.ndarray:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from blastjax.author import cut, solids
+from blastjax.author import bonds, cut, solids
 from blastjax.author.descriptions import reals
 from blastjax.author.mesh import Destructible
 from blastjax.author.shapes.boxes import SIDES, counts
@@ -61,11 +61,12 @@ def pane(
     else:
         flat = _around(reals("impact", impact, (2,)), number, width, height, rng)
     sites = np.stack([flat[:, 0], np.zeros(number), flat[:, 1]], axis=1)
+    tree = cut.voronoi(tree, sites)
     world = []
     for side in anchor:
         normal = (1.0 if side[1] == "+" else -1.0) * np.eye(3)["xyz".index(side[0])]
-        world.append((middle + normal * half, normal))
-    found = cut.destructible(cut.voronoi(tree, sites), world=world, dtype=dtype)
+        world.append(bonds.to_plane(tree.meshes, middle + normal * half, normal))
+    found = cut.destructible(tree, world=world, dtype=dtype)
     return found.destructible
 
 
@@ -112,9 +113,9 @@ def vase(
     )
     trimesh = importlib.import_module("trimesh")
     tree = cut.solid(trimesh.creation.revolve(outline, sections=sides))
-    sites = cut.uniform(tree, number, seed=seed)
-    world = [((0, 0, foot), (0, 0, -1))] if anchor else None
-    found = cut.destructible(cut.voronoi(tree, sites), world=world, dtype=dtype)
+    tree = cut.voronoi(tree, cut.uniform(tree, number, seed=seed))
+    world = [bonds.to_plane(tree.meshes, (0, 0, foot), (0, 0, -1))] if anchor else ()
+    found = cut.destructible(tree, world=world, dtype=dtype)
     return found.destructible
 
 
