@@ -13,11 +13,13 @@ are.
 | `scene` | host: MJCF from an asset and the user's own model, with all validation |
 | `bodies` | which actor rides in which slot, and where that puts its chunks |
 | `contact` | pairs, manifolds and caps; forces and impulses on the chunks |
+| `hull` | convex hulls that differ, by one collider for all pairs |
+| `tables` | host: which hull each geom has, and the meshes that are drawn |
 | `solver` | the contact problem, by Newton's method with an implicit derivative |
 | `engine` | the only tie to MJX's private functions; a canary test watches it |
 """
 
-from blastjax.rigid import bodies, contact, engine, scene, solver
+from blastjax.rigid import bodies, contact, engine, hull, scene, solver
 from blastjax.rigid.scene import Scene, build
 
-__all__ = ["Scene", "bodies", "build", "contact", "engine", "scene", "solver"]
+__all__ = ["Scene", "bodies", "build", "contact", "engine", "hull", "scene", "solver"]
