@@ -53,7 +53,9 @@ def main(path: str | None = None, shards: int = 24, seconds: float = 1.6) -> Non
     print(f"{len(thing.meshes)} chunks of {int(shapes.size.shape[1])} faces at most")
     print(f"{loose} pieces after {seconds} s, fastest {speed:.2f} m/s or rad/s")
     if path is not None:
-        pictures, _ = render.frames(scene, poses, width=480, height=360)
+        with render.Renderer(scene, width=480, height=360, zoom=0.55) as drawing:
+            drawing.camera.lookat[2] = 0.4
+            pictures = [drawing.draw(pose) for pose in poses]
         print("wrote", render.save(pathlib.Path(path), pictures))
 
 

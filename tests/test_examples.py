@@ -83,3 +83,10 @@ def test_build_a_gate(capsys, tmp_path):
     count = load("build_a_gate").main(tmp_path / "gate.glb")
     assert "1000 kg: held" in capsys.readouterr().out
     assert len(trimesh.load_scene(tmp_path / "gate.glb").geometry) == count > 1
+
+
+@pytest.mark.slow
+def test_falling_vase(capsys):
+    load("falling_vase").main(shards=4, seconds=0.6)
+    pieces = int(capsys.readouterr().out.splitlines()[1].split()[0])
+    assert pieces > 1

@@ -75,7 +75,8 @@ def fit(
       destructible: an asset and its meshes.
       vertices: most vertices of a hull. Fewer cost less time in every step.
       max_hulls: most hulls of a chunk. With more than 1, a chunk that fills less than
-        `convexity` of its hull is decomposed (package coacd, extra "geometry").
+        `convexity` of its hull is decomposed (package coacd, extra "geometry"), which
+        takes seconds for each.
       convexity: volume of a chunk over that of its hull, below which it is.
 
     Raises:

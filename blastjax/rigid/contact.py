@@ -147,7 +147,7 @@ def make_data(scene: Scene) -> mjx.Data:
     """Return data at the model's start, with room for what the colliders find."""
     model = scene.model
     data = mjx.make_data(model, impl="jax")
-    if data._impl.ncon == 0:
+    if data._impl.ncon == 0 or scene.hulls is None:
         return data
     cap = engine.numeric(model, "max_geom_pairs")
     counts: dict[int, int] = {}

@@ -95,10 +95,12 @@ def with_meshes(spec: mujoco.MjSpec, solids: dict[str, Mesh]) -> mujoco.MjModel:
     for geom in list(spec.geoms):
         if geom.name in solids:
             mesh = solids[geom.name]
+            # No two faces share a corner: MuJoCo would draw broken edges as smooth.
+            corners = np.asarray(mesh.vertices, dtype=float)[mesh.faces]
             made = spec.add_mesh(
                 name=f"mesh of {geom.name}",
-                uservert=np.asarray(mesh.vertices, dtype=float).reshape(-1),
-                userface=np.asarray(mesh.faces, dtype=np.int32).reshape(-1),
+                uservert=corners.reshape(-1),
+                userface=np.arange(corners.size // 3, dtype=np.int32),
             )
             # Nothing is weighed by it, so thin and tiny pieces may pass.
             made.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
