@@ -30,32 +30,28 @@ ROWS = 8
 """Rows of labels summed at a time."""
 
 
-class Side(NamedTuple):
-    """What every turn of a sweep reads: a node's neighbours on one side of it."""
+class Order(NamedTuple):
+    """What every turn of a sweep reads, forward (0) and backward (1).
+
+    A node's neighbours are those that the sweep has visited before it.
+    """
 
     visit: jax.Array
-    """(N,) node by turn."""
+    """(2, N,) node by turn."""
     kind: jax.Array
-    """(N,) by turn, index into DEGREES; one beyond its end for hubs."""
+    """(2, N,) by turn, index into DEGREES; one beyond its end for hubs."""
     near: jax.Array
-    """(N, K) by turn, the first neighbours; the node itself where there are less."""
+    """(2, N, K) by turn, the first neighbours; the node itself where there are less."""
     by: jax.Array
-    """(N, K) by turn, the edges to them; B where there are less."""
+    """(2, N, K) by turn, the edges to them; B where there are less."""
     start: jax.Array
-    """(N,) by turn, where its neighbours begin in `node`."""
-    count: jax.Array
-    """(N,) by turn, how many it has."""
+    """(2, N,) by turn, where its neighbours begin in `node`."""
+    degree: jax.Array
+    """(2, N,) by turn, how many it has."""
     node: jax.Array
-    """(B,) all neighbours, one node's after the other's."""
+    """(2, B,) all neighbours, one node's after the other's."""
     edge: jax.Array
-    """(B,) the edges to them."""
-
-
-class Order(NamedTuple):
-    """The way sweeps take through a graph."""
-
-    forward: Side
-    backward: Side
+    """(2, B,) the edges to them."""
 
 
 def label_dtype(num_nodes: int) -> type[np.unsignedinteger]:
@@ -79,10 +75,11 @@ def order(edges: jax.Array, num_nodes: int, place: jax.Array | None = None) -> O
     a, b = edges[:, 0], edges[:, 1]
     swap = turn[a] > turn[b]
     early, late = jnp.where(swap, b, a), jnp.where(swap, a, b)
-    return Order(_side(late, early, visit), _side(early, late, visit[::-1]))
+    ways = _way(late, early, visit), _way(early, late, visit[::-1])
+    return jax.tree.map(lambda *x: jnp.stack(x), *ways)
 
 
-def _side(here: jax.Array, there: jax.Array, visit: jax.Array) -> Side:
+def _way(here: jax.Array, there: jax.Array, visit: jax.Array) -> Order:
     num_edges = here.shape[0]
     edge = jnp.arange(num_edges, dtype=jnp.int32)
     _, edge = lax.sort_key_val(here, edge)
@@ -97,7 +94,7 @@ def _side(here: jax.Array, there: jax.Array, visit: jax.Array) -> Side:
     entry = jnp.minimum(start[:, None] + slot, num_edges - 1)
     near = jnp.where(there_is, node[entry], visit[:, None])
     by = jnp.where(there_is, edge[entry], num_edges)
-    return Side(visit, kind, near, by, start, count, node, edge)
+    return Order(visit, kind, near, by, start, count, node, edge)
 
 
 def islands(way: Order, dead: jax.Array) -> jax.Array:
@@ -111,59 +108,60 @@ def islands(way: Order, dead: jax.Array) -> jax.Array:
     Returns:
       (N, T) labels.
     """
-    num_nodes, lanes = way.forward.visit.shape[0], dead.shape[1]
+    num_nodes, lanes = way.visit.shape[1], dead.shape[1]
     rows = -(-num_nodes // ROWS) * ROWS
     labels = lax.broadcasted_iota(dead.dtype, (rows, lanes), 0)
 
-    def pair(
+    def half(
         carry: tuple[jax.Array, jax.Array, jax.Array, jax.Array],
     ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
         labels, total, count, _ = carry
-        labels = _sweep(labels, dead, way.backward)
-        middle = _total(labels)
-        # A sweep without a change is the end: the one before it was the other way.
-        moved = jnp.any(middle != total)
-        labels = lax.cond(moved & (count >= PATIENCE), _jump, lambda x: x, labels)
-        labels = lax.cond(
-            moved, lambda x: _sweep(x, dead, way.forward), lambda x: x, labels
-        )
-        total = _total(labels)
-        return labels, total, count + 1, moved & jnp.any(total != middle)
+        jumps = (count >= 2 * PATIENCE) & (count % 2 == 0)
+        labels = lax.cond(jumps, _jump, lambda x: x, labels)
+        labels = _sweep(labels, dead, way, count % 2)
+        now = _total(labels)
+        # A sweep without a change is the end, for the one before went the other way.
+        return labels, now, count + 1, (count == 0) | jnp.any(now != total)
 
-    labels = _sweep(labels, dead, way.forward)
     start = labels, _total(labels), jnp.int32(0), jnp.array(True)
-    return lax.while_loop(lambda c: c[3], pair, start)[0][:num_nodes]
+    return lax.while_loop(lambda c: c[3], half, start)[0][:num_nodes]
 
 
-def _sweep(labels: jax.Array, dead: jax.Array, side: Side) -> jax.Array:
+def _sweep(
+    labels: jax.Array, dead: jax.Array, way: Order, side: jax.Array
+) -> jax.Array:
     def offer(labels: jax.Array, node: jax.Array, edge: jax.Array) -> jax.Array:
         return _row(labels, node) | _row(dead, edge)
 
     def of_degree(degree: int) -> Callable[[jax.Array, jax.Array], jax.Array]:
         def relax(labels: jax.Array, i: jax.Array) -> jax.Array:
-            low = _row(labels, side.visit[i])
+            low = _row(labels, way.visit[side, i])
             for j in range(degree):
-                low = jnp.minimum(low, offer(labels, side.near[i, j], side.by[i, j]))
+                node, edge = way.near[side, i, j], way.by[side, i, j]
+                low = jnp.minimum(low, offer(labels, node, edge))
             return low
 
         return relax
 
     def hub(labels: jax.Array, i: jax.Array) -> jax.Array:
         def one(j: jax.Array, low: jax.Array) -> jax.Array:
-            j = side.start[i] + j
-            return jnp.minimum(low, offer(labels, side.node[j], side.edge[j]))
+            j = way.start[side, i] + j
+            node, edge = way.node[side, j], way.edge[side, j]
+            return jnp.minimum(low, offer(labels, node, edge))
 
-        return lax.fori_loop(0, side.count[i], one, _row(labels, side.visit[i]))
+        low = _row(labels, way.visit[side, i])
+        return lax.fori_loop(0, way.degree[side, i], one, low)
 
     branches = [*map(of_degree, DEGREES), hub]
 
     def turn(i: jax.Array, labels: jax.Array) -> jax.Array:
-        low = lax.switch(side.kind[i], branches, labels, i)
+        low = lax.switch(way.kind[side, i], branches, labels, i)
         # Without the barrier XLA computes the row anew wherever it is read.
         low = lax.optimization_barrier(low)
-        return lax.dynamic_update_slice(labels, low, (side.visit[i], jnp.int32(0)))
+        here = way.visit[side, i], jnp.int32(0)
+        return lax.dynamic_update_slice(labels, low, here)
 
-    return lax.fori_loop(0, side.visit.shape[0], turn, labels)
+    return lax.fori_loop(0, way.visit.shape[1], turn, labels)
 
 
 def _row(x: jax.Array, i: jax.Array) -> jax.Array:
