@@ -7,7 +7,18 @@ Importing this loads jax and numpy only. The rooms that need MuJoCo, Brax or gym
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from blastjax import author, chunks, core, damage, fracture, graph, spatial, stress
+from blastjax import (
+    author,
+    chunks,
+    core,
+    damage,
+    fracture,
+    graph,
+    serialize,
+    soft,
+    spatial,
+    stress,
+)
 from blastjax.core import Asset, Damage, State
 
 if TYPE_CHECKING:
@@ -28,6 +39,8 @@ __all__ = [
     "graph",
     "render",
     "rigid",
+    "serialize",
+    "soft",
     "spatial",
     "stress",
     "world",

@@ -34,12 +34,18 @@ def _take(values: jax.Array, index: jax.Array, fill: float) -> jax.Array:
 
 
 def element_values(asset: Asset, values: jax.Array, fill: float = 0) -> jax.Array:
-    """Return per-chunk values (C, ...) per element (A, ...), fill where no chunk is."""
+    """Return per-chunk values (C, ...) per element (A, ...), fill where no chunk is.
+
+    A copy of values: differentiable, exactly.
+    """
     return _take(values, asset.element_chunk, fill)
 
 
 def is_chunk(asset: Asset) -> jax.Array:
-    """Return which elements are chunks, (A,) bool: not the world, not padding."""
+    """Return which elements are chunks, (A,) bool: not the world, not padding.
+
+    Piecewise constant: no derivative passes.
+    """
     return asset.element_chunk >= 0
 
 
@@ -47,6 +53,8 @@ def active(asset: Asset, state: State) -> jax.Array:
     """Return which labels name an actor, (A,) bool.
 
     The world alone is no actor.
+
+    Piecewise constant: no derivative passes.
     """
     labels = jnp.arange(state.actor.shape[0], dtype=jnp.int32)
     named = state.actor == labels
@@ -59,6 +67,8 @@ def node_count(asset: Asset, state: State) -> jax.Array:
     """Return the graph nodes of each actor, the world included, (A,) int32 by label.
 
     Sub-support actors have none.
+
+    Piecewise constant: no derivative passes.
     """
     owner = state.actor[: asset.span_node.shape[0]]
     return graph.group_sum(jnp.ones_like(owner), owner, state.actor.shape[0])
@@ -68,6 +78,8 @@ def alone(asset: Asset, state: State) -> jax.Array:
     """Return which elements are an actor by themselves, (A,) bool.
 
     These take damage to their chunk; an actor of several nodes takes it to its bonds.
+
+    Piecewise constant: no derivative passes.
     """
     count = node_count(asset, state)
     owned = (state.actor != NONE) & is_chunk(asset)
@@ -75,7 +87,10 @@ def alone(asset: Asset, state: State) -> jax.Array:
 
 
 def held(asset: Asset, state: State) -> jax.Array:
-    """Return which actors the world holds, (A,) bool by label."""
+    """Return which actors the world holds, (A,) bool by label.
+
+    Piecewise constant: no derivative passes.
+    """
     first = jnp.arange(state.actor.shape[0], dtype=jnp.int32) == 0
     return active(asset, state) & first & asset.has_world
 
@@ -84,6 +99,8 @@ def can_fracture(asset: Asset, state: State) -> jax.Array:
     """Return which actors damage can still change, (A,) bool by label.
 
     An actor of several nodes always can; a single chunk only while it has health.
+
+    Piecewise constant: no derivative passes.
     """
     several = node_count(asset, state) > 1
     return active(asset, state) & (several | (state.chunk_health > 0))
@@ -94,6 +111,8 @@ def split_required(asset: Asset, state: State) -> jax.Array:
 
     True of an actor of several nodes that lost a bond (it may still hold together), and
     of a single chunk without health that has children.
+
+    Piecewise constant: no derivative passes.
     """
     capacity = state.actor.shape[0]
     several = node_count(asset, state) > 1
@@ -104,7 +123,10 @@ def split_required(asset: Asset, state: State) -> jax.Array:
 
 
 def has_children(asset: Asset) -> jax.Array:
-    """Return which elements' chunks have children, (A,) bool."""
+    """Return which elements' chunks have children, (A,) bool.
+
+    Piecewise constant: no derivative passes.
+    """
     return element_values(asset, asset.chunk_children) > 0
 
 
@@ -113,6 +135,8 @@ def owner(asset: Asset, state: State) -> jax.Array:
 
     A chunk above the support level belongs to an actor if all support chunks below it
     do; a chunk below it, if the support chunk above gave way and its turn has come.
+
+    Piecewise constant: no derivative passes.
     """
     direct = _take(state.actor, asset.chunk_element, NONE)
     if asset.height == 0:
@@ -131,7 +155,10 @@ def owner(asset: Asset, state: State) -> jax.Array:
 
 
 def visible(asset: Asset, state: State) -> jax.Array:
-    """Return the visible chunks, (C,) bool: the coarsest that stand for each actor."""
+    """Return the visible chunks, (C,) bool: the coarsest that stand for each actor.
+
+    Piecewise constant: no derivative passes.
+    """
     chunk_owner = owner(asset, state)
     parent_owner = _take(chunk_owner, asset.chunk_parent, NONE)
     return (chunk_owner != NONE) & (parent_owner != chunk_owner)

@@ -37,7 +37,11 @@ def falloff(
     *,
     actors: jax.Array | None = None,
 ) -> Damage:
-    """Damage around a point (3,): the falloff profile of the distance to it."""
+    """Damage around a point (3,): the falloff profile of the distance to it.
+
+    Differentiable in position, amount and radii; misses the jump where the profile
+    ends if both radii are equal.
+    """
     profile = _falloff(asset, amount, min_radius, max_radius)
     return _radial(asset, state, lambda x: _distance(x, position), profile, actors)
 
@@ -52,7 +56,11 @@ def cutter(
     *,
     actors: jax.Array | None = None,
 ) -> Damage:
-    """Damage in a shell around a point (3,): the cutter profile of the distance."""
+    """Damage in a shell around a point (3,): the cutter profile of the distance.
+
+    Differentiable in amount; misses the jumps at both radii, so the derivative by
+    position and radii is zero.
+    """
     amount, low, high = _scalars(asset, amount, min_radius, max_radius)
 
     def profile(r: jax.Array) -> jax.Array:
@@ -72,7 +80,10 @@ def capsule(
     *,
     actors: jax.Array | None = None,
 ) -> Damage:
-    """Damage around a segment, (3,) to (3,): the falloff profile of the distance."""
+    """Damage around a segment, (3,) to (3,): the falloff profile of the distance.
+
+    Differentiable in both ends, amount and radii, as `falloff` is.
+    """
     profile = _falloff(asset, amount, min_radius, max_radius)
 
     def distance(x: jax.Array) -> jax.Array:
@@ -219,7 +230,10 @@ def impact_spread(
 
 
 def restrict(asset: Asset, state: State, damage: Damage, actors: jax.Array) -> Damage:
-    """Keep only the damage to the given actors, (A,) bool by label."""
+    """Keep only the damage to the given actors, (A,) bool by label.
+
+    Differentiable in damage; which actor a bond belongs to is constant.
+    """
     bond, chunk = damage.bond, damage.chunk
     if bond is not None:
         bond = jnp.where(_chosen(state.actor[asset.bond_nodes[:, 0]], actors), bond, 0)
@@ -244,6 +258,9 @@ def normalize(material: Material, amount: Scalar) -> jax.Array:
     """Return raw damage in units of the material's health, between its thresholds.
 
     To a material without health any damage is one unit. NaN does nothing.
+
+    Differentiable in amount and health between the thresholds; misses the jump at
+    the lower one.
     """
     amount = jnp.asarray(amount)
     health = jnp.asarray(material.health, amount.dtype)
@@ -270,6 +287,8 @@ def buffer(example: Any, capacity: int) -> Buffer:
 
     Raises:
       ValueError: the capacity is below 1.
+
+    Holds zeros, with no derivative to speak of.
     """
     if capacity < 1:
         raise ValueError(f"capacity is {capacity}; a buffer holds at least one event")
@@ -280,7 +299,10 @@ def buffer(example: Any, capacity: int) -> Buffer:
 
 
 def push(buffer: Buffer, event: Any) -> Buffer:
-    """Append an event, or count it as dropped if the buffer is full."""
+    """Append an event, or count it as dropped if the buffer is full.
+
+    Differentiable in the event.
+    """
     capacity = jax.tree.leaves(buffer.events)[0].shape[0]
     fits = buffer.count < capacity
     # Out of range, and so ignored, when the buffer is full.

@@ -51,6 +51,8 @@ def init(
 
     Raises:
       ValueError: a health array has another shape.
+
+    Differentiable in the healths of what is real.
     """
     dtype = asset.chunk_centroid.dtype
     num_nodes, capacity = asset.span_node.shape[0], asset.element_chunk.shape[0]
@@ -206,6 +208,9 @@ def apply_buffer(
 
     Returns:
       The state, and the events summed over the buffer.
+
+    Differentiable as `apply` and the program are; misses that a bond which broke
+    earlier would change what later events see.
     """
 
     def one(state: State, item: tuple[Any, jax.Array]) -> tuple[State, Any]:
@@ -285,6 +290,8 @@ def deactivate(asset: Asset, state: State, actors: jax.Array) -> State:
       asset: the asset.
       state: its state.
       actors: (A,) bool by label. The world itself always stays.
+
+    Differentiable in healths; which actors go is constant.
     """
     num_nodes = asset.span_node.shape[0]
     out = (state.actor != NONE) & actors[jnp.maximum(state.actor, 0)]
@@ -303,7 +310,11 @@ def deactivate(asset: Asset, state: State, actors: jax.Array) -> State:
 def step(
     asset: Asset, state: State, damage: Damage
 ) -> tuple[State, tuple[FractureEvents, SplitEvents]]:
-    """Apply damage and split."""
+    """Apply damage and split.
+
+    Healths are differentiable, as in `apply`; the split is not: `soft` has derivatives
+    that see it.
+    """
     state, fractured = apply(asset, state, damage)
     state, parted = split(asset, state)
     return state, (fractured, parted)

@@ -277,7 +277,10 @@ def _ends(pointer: jax.Array) -> jax.Array:
 
 
 def group_sum(values: jax.Array, group: jax.Array, num_groups: int) -> jax.Array:
-    """Sum rows of values (n, ...) by their group (n,) into (num_groups, ...)."""
+    """Sum rows of values (n, ...) by their group (n,) into (num_groups, ...).
+
+    Differentiable in values, exactly.
+    """
     # Negative numbers would count from the end; out of range, they are dropped.
     group = jnp.where(group < 0, num_groups, group)
     zeros = jnp.zeros((num_groups, *values.shape[1:]), values.dtype)
@@ -285,6 +288,9 @@ def group_sum(values: jax.Array, group: jax.Array, num_groups: int) -> jax.Array
 
 
 def group_any(flags: jax.Array, group: jax.Array, num_groups: int) -> jax.Array:
-    """Return whether any flag (n,) of each group is set, (num_groups,) bool."""
+    """Return whether any flag (n,) of each group is set, (num_groups,) bool.
+
+    Piecewise constant: no derivative passes.
+    """
     group = jnp.where(group < 0, num_groups, group)
     return jnp.zeros(num_groups, bool).at[group].max(flags, mode="drop")

@@ -324,10 +324,12 @@ def _camera(
 def _colors(scene: Scene, shown: Pose) -> dict[int, np.ndarray]:
     """Return the colour (4,) of each chunk's geom, transparent if it is gone."""
     colors = {}
-    for geom, element in zip(scene.host.geom, scene.host.element, strict=True):
+    for geom, element in enumerate(scene.host.geom_element):
+        if element < 0:
+            continue
         label = int(shown.actor[element])
         if label == NONE:
-            colors[int(geom)] = np.zeros(4)
+            colors[geom] = np.zeros(4)
             continue
         # Neighbours in one actor differ a little, actors differ in hue.
         shade = 0.9 + 0.1 * ((element * 0.618) % 1.0)
@@ -338,7 +340,7 @@ def _colors(scene: Scene, shown: Pose) -> dict[int, np.ndarray]:
         else:
             hue = (0.08 + label * 0.618034) % 1.0
             color = np.array(colorsys.hsv_to_rgb(hue, 0.55, 0.9)) * shade
-        colors[int(geom)] = np.append(color, 1.0)
+        colors[geom] = np.append(color, 1.0)
     return colors
 
 

@@ -10,7 +10,10 @@ import jax.numpy as jnp
 
 
 def dot(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Return the inner product of (..., 3) vectors, summed x, y, z."""
+    """Return the inner product of (..., 3) vectors, summed x, y, z.
+
+    Differentiable, exactly.
+    """
     # Written out because the order of summation is part of Blast's float32 results.
     return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
 
@@ -23,19 +26,28 @@ def norm(vector: jax.Array) -> jax.Array:
 
 
 def unit(vector: jax.Array) -> jax.Array:
-    """Return (..., 3) vectors at length 1, or zero where they have no length."""
+    """Return (..., 3) vectors at length 1, or zero where they have no length.
+
+    Differentiable; the derivative at zero is one over a length of one.
+    """
     length = norm(vector)[..., None]
     return vector / jnp.where(length > 0, length, 1.0)
 
 
 def ratio(numerator: jax.Array, denominator: jax.Array) -> jax.Array:
-    """Return the quotient, or zero where the denominator is zero."""
+    """Return the quotient, or zero where the denominator is zero.
+
+    Differentiable where the denominator is not zero; zero there.
+    """
     safe = denominator != 0
     return jnp.where(safe, numerator / jnp.where(safe, denominator, 1.0), 0.0)
 
 
 def point_to_segment(point: jax.Array, start: jax.Array, end: jax.Array) -> jax.Array:
-    """Return the distance of (..., 3) points to the segment from start to end, m."""
+    """Return the distance of (..., 3) points to the segment from start to end, m.
+
+    Differentiable; the derivative at distance zero is zero.
+    """
     along = end - start
     offset = point - start
     projected = dot(offset, along)
@@ -54,6 +66,8 @@ def segment_hits_triangle(
 
     The edges of the triangle and a degenerate triangle are never hit; the ends of the
     segment reach 1e-4 of its length further, as in Blast.
+
+    Piecewise constant: no derivative passes.
     """
     a, b, c = (jnp.broadcast_to(corner, start.shape) for corner in triangle)
     doubled = jnp.cross(b - a, c - a)
@@ -69,12 +83,32 @@ def segment_hits_triangle(
 
 
 def rotate(vector: jax.Array, quaternion: jax.Array) -> jax.Array:
-    """Return (..., 3) vectors rotated by (..., 4) unit quaternions."""
+    """Return (..., 3) vectors rotated by (..., 4) unit quaternions.
+
+    Differentiable, exactly.
+    """
     w, axis = quaternion[..., :1], quaternion[..., 1:]
     turn = 2.0 * jnp.cross(axis, vector)
     return vector + w * turn + jnp.cross(axis, turn)
 
 
 def conjugate(quaternion: jax.Array) -> jax.Array:
-    """Return the inverse rotation of (..., 4) unit quaternions."""
+    """Return the inverse rotation of (..., 4) unit quaternions.
+
+    Differentiable, exactly.
+    """
     return jnp.concatenate([quaternion[..., :1], -quaternion[..., 1:]], axis=-1)
+
+
+def matrix(quaternion: jax.Array) -> jax.Array:
+    """Return (..., 4) unit quaternions as rotation matrices (..., 3, 3).
+
+    Differentiable, exactly.
+    """
+    w, x, y, z = jnp.moveaxis(quaternion, -1, 0)
+    rows = [
+        [w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z],
+    ]
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)

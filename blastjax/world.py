@@ -7,17 +7,17 @@ pairs of chunks) is not in the program.
 """
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from mujoco import mjx
 
 from blastjax import chunks, fracture, graph, pytree, spatial
 from blastjax.core import NONE, Damage, FractureEvents, SplitEvents, State
 from blastjax.damage import falloff
-from blastjax.rigid import bodies, contact, engine, solver
+from blastjax.rigid import bodies, contact, engine, rows, solver
 from blastjax.rigid.scene import Scene
 from blastjax.stress.equilibrium import Structure
 from blastjax.stress.failure import Verdict, judge, stress_damage
@@ -145,10 +145,12 @@ def init(
       velocity: (3,) of the rest frame's origin, m/s; the world's part stays still.
       spin: (3,) angular velocity in world axes, rad/s.
       remove_dead: see `step`.
+
+    Differentiable in healths, velocity and spin.
     """
     if state is None:
         state = fracture.init(scene.asset, bond_health, chunk_health)
-    data = engine.without_matrices(mjx.make_data(scene.model, impl="jax"))
+    data = engine.without_matrices(contact.make_data(scene))
     return _begin(scene, data, state, velocity, spin, remove_dead)
 
 
@@ -211,6 +213,10 @@ def step(
     Returns:
       The world and what happened. Without damage, impact and stress nothing can break,
       and nothing of fracture is in the program.
+
+    Differentiable, forward and reverse, through contact (by the implicit function
+    theorem), friction and damage. Misses the jumps: contacts that begin or end within
+    the step, bonds that break, actors that part, what the caps leave out.
     """
     riding, data = world.bodies, world.data
     data = data if ctrl is None else data.replace(ctrl=ctrl)
@@ -220,10 +226,9 @@ def step(
     data = bodies.place(scene, riding, data)
     data = bodies.kinematics(scene, model, riding, data)
     data, found = contact.collide(scene, riding, model, data)
-    data = engine.constraint_rows(model, data, found.riders.body)
     data = engine.position_sensors(model, data)
     data = engine.smooth_acceleration(model, data, bodies.empty_dofs(scene, riding))
-    data, report = contact.resolve(model, data, scene.line_search)
+    data, report = rows.resolve(scene, model, data, riding, frames, found.riders)
     data = engine.integrate(model, data)
     force = contact.normal_force(data)
 
@@ -262,6 +267,45 @@ def step(
     return world, events
 
 
+def rollout(
+    scene: Scene,
+    world: World,
+    length: int,
+    *,
+    ctrl: jax.Array | None = None,
+    record: Callable[[World, Events], Any] | None = None,
+    **options: Any,
+) -> tuple[World, Any]:
+    """Advance by many steps, in little memory when differentiated in reverse.
+
+    Args:
+      scene: the scene.
+      world: the world.
+      length: number of steps.
+      ctrl: (length, nu) controls of each step; by default those in the data.
+      record: what to keep of each step, of the world after it and its events.
+      **options: of `step`, the same for all steps.
+
+    Returns:
+      The world at its end, and the records, stacked (length, ...); None without.
+      Derivatives are those of `step`, forward and reverse. Reverse mode keeps one
+      world a step, and computes each step a second time to get at its inside.
+
+    Raises:
+      ValueError: `length` is below 1.
+    """
+    if length < 1:
+        raise ValueError(f"length is {length}; give 1 or more")
+
+    def one(world: World, ctrl: jax.Array | None) -> tuple[World, Any]:
+        world, events = step(scene, world, ctrl=ctrl, **options)
+        return world, None if record is None else record(world, events)
+
+    # Within a scan nothing can be shared with the first time anyway.
+    again = jax.checkpoint(one, prevent_cse=False)
+    return jax.lax.scan(again, world, ctrl, length=length)
+
+
 def impact_damage(
     scene: Scene,
     world: World,
@@ -284,6 +328,8 @@ def impact_damage(
       Damage: for each bond, and each chunk that is an actor by itself, the sum over all
       contacts on its actor, each weighted by the falloff of the distance in the rest
       frame. Every contact counts, there is no cap.
+
+    Differentiable in forces, places and how contacts hurt.
     """
     asset, state, touch = scene.asset, world.state, world.data._impl.contact
     excess = jnp.maximum(force - impact.threshold, 0.0)
@@ -329,6 +375,9 @@ def bear(
       frames: of the slots when the contacts were found.
       carried: what carried each geom then.
       stress: how loads hurt.
+
+    Differentiable in loads, by the implicit function theorem; the grouping into
+    actors is constant.
     """
     asset, none = scene.asset, jnp.zeros_like(node_place(scene.asset))
     load = Load(force=none, torque=none)
@@ -349,7 +398,10 @@ def bear(
 
 
 def held_weight(scene: Scene, state: State, mass: jax.Array) -> Load:
-    """Return the weight (N,) of what the world holds, in the rest frame."""
+    """Return the weight (N,) of what the world holds, in the rest frame.
+
+    Differentiable in mass and gravity; what is held is constant.
+    """
     held = state.actor[: mass.shape[0]] == 0
     back = spatial.conjugate(scene.quaternion)
     down = spatial.rotate(scene.model.opt.gravity.astype(mass.dtype), back)
@@ -362,12 +414,14 @@ def contact_load(
     """Return the contact forces on the nodes, each in its actor's rest frame.
 
     Chunks below the support level have no bonds, and no load.
+
+    Differentiable in forces and places of contacts.
     """
     place = node_place(scene.asset)
     num_nodes, touch = place.shape[0], data._impl.contact
     element = jnp.asarray(scene.host.geom_element, jnp.int32)
     total = Load(force=jnp.zeros_like(place), torque=jnp.zeros_like(place))
-    push = contact_force(data)
+    push = engine.contact_force(data)
     for side in scene.host.chunk_sides:
         geom = touch.geom[:, side]
         slot = jnp.maximum(carried.slot[geom], 0)
@@ -382,30 +436,6 @@ def contact_load(
         )
         total = add(total, part)
     return total
-
-
-def contact_force(data: mjx.Data) -> jax.Array:
-    """Return the force of each contact on its second geom, (contacts, 3) N, world axes.
-
-    Friction of rolling and twisting is left out.
-    """
-    impl = data._impl
-    touch, start = impl.contact, impl.ne + impl.nf + impl.nl
-    parts = []
-    for size in (1, 3, 4, 6):
-        count = int(np.sum(touch.dim == size))
-        rows = 1 if size == 1 else 2 * (size - 1)
-        block = impl.efc_force[start : start + count * rows].reshape(count, rows)
-        start += count * rows
-        local = jnp.zeros((count, 3), block.dtype).at[:, 0].set(block.sum(axis=1))
-        if size > 1:
-            # Opposite edges of the pyramid: their difference is the friction.
-            edges = block[:, :4].reshape(count, 2, 2)
-            local = local.at[:, 1:].set(edges[..., 0] - edges[..., 1])
-        parts.append(local)
-    local = jnp.concatenate(parts)
-    local = local.at[:, 1:].multiply(touch.friction[:, :2])
-    return jnp.einsum("ni,nij->nj", local, touch.frame)
 
 
 def _strain(state: State, verdict: Verdict, stress: Stress) -> Damage:

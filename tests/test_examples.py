@@ -4,6 +4,7 @@ import importlib.util
 import pathlib
 
 import numpy as np
+import pytest
 
 from tests.test_envs import SMALL
 
@@ -42,7 +43,43 @@ def test_which_brick(capsys, tmp_path):
     assert (tmp_path / "table.png").stat().st_size > 5000
 
 
+def test_break_a_vase(capsys, tmp_path):
+    actors = load("break_a_vase").main(tmp_path)
+    assert actors > 3
+    assert "48 shards" in capsys.readouterr().out
+    assert len(list(tmp_path.glob("vase*.png"))) == 3
+
+
+def test_aim_a_shot(capsys, tmp_path):
+    aimed, _ = load("aim_a_shot").main(tmp_path / "aim.png", rounds=3)
+    assert aimed == 0
+    assert "free exactly 18 of 256" in capsys.readouterr().out
+    assert (tmp_path / "aim.png").stat().st_size > 5000
+
+
+def test_how_strong(capsys, tmp_path):
+    picture = tmp_path / "strength.png"
+    seen, new, guess = load("how_strong").main(picture, count=8, steps=200)
+    assert seen > 0.9 and new > guess
+    assert "all bricks alike" in capsys.readouterr().out
+    assert picture.stat().st_size > 5000
+
+
+@pytest.mark.slow
+def test_soft_landing(capsys, tmp_path):
+    before, after, pieces = load("soft_landing").main(tmp_path / "landing.png")
+    assert before > 1 > after and pieces == 1
+    assert "first throw" in capsys.readouterr().out
+
+
 def test_size_a_beam(capsys):
     after = load("size_a_beam").main(length=4, steps=40)
     np.testing.assert_allclose(after, 2.0, rtol=0.01)
     assert "safety before" in capsys.readouterr().out
+
+
+def test_build_a_gate(capsys, tmp_path):
+    trimesh = pytest.importorskip("trimesh")
+    count = load("build_a_gate").main(tmp_path / "gate.glb")
+    assert "1000 kg: held" in capsys.readouterr().out
+    assert len(trimesh.load_scene(tmp_path / "gate.glb").geometry) == count > 1

@@ -109,6 +109,90 @@ def test_same_world_same_future(rubble):
         assert bool(jnp.all(a == b))
 
 
+# Extremes, each a lane of one batch: (density of the upper cube, time constant of the
+# floor, time step, height).
+
+EXTREMES = {
+    "plain": (1e3, 0.02, 0.004, 0.001),
+    "mass ratio 1e6": (1e-3, 0.02, 0.004, 0.001),
+    "stiff": (1e3, 0.008, 0.004, 0.001),
+    "stiffer than the step": (1e3, 1e-5, 0.004, 0.001),
+    "huge step": (1e3, 0.02, 0.1, 0.001),
+    "tiny step": (1e3, 0.02, 1e-5, 0.001),
+    "in the floor": (1e3, 0.02, 0.004, -0.2),
+    "not finite": (1e3, 0.02, 0.004, np.nan),
+}
+
+
+@pytest.fixture(scope="module")
+def extremes():
+    """Worlds after 400 steps, their last events and the greatest speed, by name."""
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        scene = build(shapes.grid((1, 1, 2), EDGE), slots=2, chunk_contacts=False)
+
+        def varied(density, constant, dt):
+            model = scene.model
+            solref = model.geom_solref.at[:, 0].set(constant)
+            return scene.replace(
+                density=jnp.stack([jnp.float32(1e3), density]),
+                model=model.tree_replace({"geom_solref": solref, "opt.timestep": dt}),
+            )
+
+        def roll(lane, moment):
+            scene = varied(*lane[:3])
+
+            def one(carry, _):
+                moment, events = world.step(scene, carry[0])
+                speed = jnp.abs(moment.data.qvel).max()
+                return (moment, events, jnp.maximum(carry[2], speed)), None
+
+            first = *world.step(scene, moment), jnp.zeros(())
+            return jax.lax.scan(one, first, length=399)[0]
+
+        def start(lane):
+            moment = world.init(varied(*lane[:3]))
+            z = int(scene.host.slot_qpos[0, 2])
+            qpos = moment.data.qpos.at[z].add(lane[3])
+            return moment.replace(data=moment.data.replace(qpos=qpos))
+
+        lanes = jnp.asarray(list(EXTREMES.values()), jnp.float32)
+        moment = jax.tree.map(lambda *x: jnp.stack(x), *map(start, lanes))
+        moment, events, fastest = jit(jax.vmap(roll))(lanes, moment)
+
+        def pick(tree, i):
+            return jax.tree.map(lambda x: x[i], tree)
+
+        return scene, {
+            name: (pick(moment, i), pick(events, i), float(fastest[i]))
+            for i, name in enumerate(EXTREMES)
+        }
+
+
+@pytest.mark.parametrize("name", EXTREMES)
+def test_extremes_stay_finite_or_say_so(extremes, name):
+    scene, found = extremes
+    moment, events, fastest = found[name]
+    density, _, dt, _ = EXTREMES[name]
+    if name == "not finite":
+        # It says so, and the worlds beside it in the batch do not notice.
+        assert np.isnan(events.solver.residual)
+        return
+    assert finite(moment)
+    assert float(events.solver.residual) < 1e-3
+    assert fastest < {"in the floor": 10.0}.get(name, 2.0)
+    if name == "tiny step":
+        time = 400 * dt
+        np.testing.assert_allclose(moment.data.qvel[2], -9.81 * time, rtol=1e-3)
+        return
+    weight = 9.81 * 0.125 * (1e3 + density)
+    force = float(events.impulse.sum()) / dt
+    assert abs(force / weight - 1) < 1e-3
+    assert float(jnp.abs(moment.data.qvel).max()) < 1e-3
+    place, _ = bodies.chunk_poses(scene, moment.bodies, moment.data)
+    assert abs(float(jnp.linalg.norm(place[1] - place[0])) - 0.5) < 1e-6
+    assert float(place[0, 2]) > 0.24
+
+
 # A ball against a wall that the world holds.
 
 BALL = """
@@ -263,12 +347,15 @@ def test_derivative_of_a_rollout_is_its_difference_quotient():
             qvel = start.data.qvel.at[:6].add(push)
             moment = start.replace(data=start.data.replace(qvel=qvel))
 
-            def one(moment, _):
-                return world.step(scene, moment, impact=impact)[0], None
-
-            moment, _ = jax.lax.scan(one, moment, None, length=8)
+            moment, seen = world.rollout(
+                scene,
+                moment,
+                8,
+                impact=impact,
+                record=lambda w, _: w.state.bond_health.sum(),
+            )
             place = jnp.sum(moment.data.qpos[:3] * jnp.array([1.0, 2.0, 3.0]))
-            return place + moment.state.bond_health.sum()
+            return place + seen[-1]
 
         push = np.array([0.0, 0.0, 0.0, 0.2, -0.1, 0.3])
         both = jit(jax.value_and_grad(loss))

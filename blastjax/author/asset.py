@@ -199,15 +199,19 @@ def _keep_bonds(
     return index[keep], node[keep], turned[keep], dropped
 
 
+def _levels(depth: np.ndarray) -> list[np.ndarray]:
+    """Return the chunks of each depth, roots first, each in ascending order."""
+    order = np.argsort(depth, kind="stable")
+    return np.split(order, np.cumsum(np.bincount(depth))[:-1])
+
+
 def _support_depth(
     parent: np.ndarray, support: np.ndarray, depth: np.ndarray
 ) -> np.ndarray:
-    """Return the depth of the support chunk at or above each chunk."""
+    """Return the depth of the support chunk at or above each chunk, 0 if none is."""
     level = np.where(support, depth, 0)
-    above = support.copy()
-    for i in np.argsort(depth, kind="stable"):
-        if not above[i] and parent[i] >= 0 and above[parent[i]]:
-            above[i], level[i] = True, level[parent[i]]
+    for chunk in _levels(depth)[1:]:
+        level[chunk] = np.where(support[chunk], depth[chunk], level[parent[chunk]])
     return level
 
 
@@ -216,24 +220,21 @@ def _spans(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return nodes in depth-first order, the world last, and each chunk's range."""
     count = np.where(chunk_node >= 0, 1, 0)
-    depth = depths(parent)
-    by_depth = np.argsort(depth, kind="stable")
-    for i in by_depth[::-1]:
-        if parent[i] >= 0:
-            count[parent[i]] += count[i]
+    levels = _levels(depths(parent))
+    for chunk in levels[:0:-1]:
+        np.add.at(count, parent[chunk], count[chunk])
     start = np.zeros(len(parent), np.int64)
-    free = np.zeros(len(parent), np.int64)
-    top = 0
-    for i in by_depth:
-        if parent[i] < 0:
-            start[i], top = top, top + count[i]
-        else:
-            start[i] = free[parent[i]]
-            free[parent[i]] += count[i]
-        free[i] = start[i]
-    below = (chunk_node < 0) & (count == 0)
+    for number, chunk in enumerate(levels):
+        chunk = chunk[np.argsort(parent[chunk], kind="stable")]
+        above = parent[chunk]
+        before = np.cumsum(count[chunk]) - count[chunk]
+        # Siblings stand together: their ranges begin where the first one's does.
+        first = np.searchsorted(above, above)
+        start[chunk] = before - before[first]
+        if number:
+            start[chunk] += start[above]
     span = np.stack([start, start + count], axis=1)
-    span[below] = 0
+    span[(chunk_node < 0) & (count == 0)] = 0
     order = np.zeros(int((chunk_node >= 0).sum()), np.int64)
     carries = chunk_node >= 0
     order[start[carries]] = chunk_node[carries]

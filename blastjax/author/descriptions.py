@@ -210,13 +210,14 @@ def _array(name: str, values: Any) -> np.ndarray:
 
 def _depths(parent: np.ndarray) -> np.ndarray:
     """Return each chunk's distance to its root, -1 where a loop keeps it from one."""
-    depth = np.where(parent < 0, 0, -1)
-    for level in range(1, len(parent)):
-        reached = (depth < 0) & (depth[parent] == level - 1) & (parent >= 0)
-        if not reached.any():
+    # Each round doubles how far `above` looks: log2 of the depth, not the depth.
+    above, depth = parent, np.where(parent < 0, 0, 1)
+    for _ in range(len(parent).bit_length()):
+        if (above < 0).all():
             break
-        depth[reached] = level
-    return depth
+        depth = depth + np.where(above < 0, 0, depth[above])
+        above = np.where(above < 0, above, above[above])
+    return np.where(above < 0, depth, -1)
 
 
 def depths(parent: np.ndarray) -> np.ndarray:

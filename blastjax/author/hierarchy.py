@@ -15,7 +15,6 @@ from blastjax.author.descriptions import (
     Chunks,
     checked_bonds,
     checked_chunks,
-    depths,
     flags,
     integers,
     refuse,
@@ -41,7 +40,7 @@ def ensure_coverage(parent: np.ndarray, support: np.ndarray) -> tuple[np.ndarray
     support = flags("chunk support", support, len(parent))
     covered = _covered(parent, support)
     kept = support & ~covered
-    has_support = _subtree_any(parent, kept)
+    has_support = subtree_any(parent, kept)
     root = parent < 0
     # Not below support, nothing below itself, and the chunk above cannot take the flag.
     missing = ~has_support & ~covered & (root | has_support[parent])
@@ -168,17 +167,25 @@ def below_support(parent: np.ndarray, support: np.ndarray) -> np.ndarray:
 
 
 def _covered(parent: np.ndarray, support: np.ndarray) -> np.ndarray:
-    above = np.where(parent < 0, False, support[parent])
-    for _ in range(int(depths(parent).max(initial=0))):
-        above = above | np.where(parent < 0, False, above[parent])
-    return above
+    """Return which chunks have a flagged chunk above them."""
+    # As for depths: each round doubles how far `above` looks.
+    above = parent
+    found = np.where(parent < 0, False, support[parent])
+    while (above >= 0).any():
+        found = found | np.where(above < 0, False, found[above])
+        above = np.where(above < 0, above, above[above])
+    return found
 
 
-def _subtree_any(parent: np.ndarray, flag: np.ndarray) -> np.ndarray:
-    found = flag.copy()
-    child = parent >= 0
-    for _ in range(int(depths(parent).max(initial=0))):
-        np.logical_or.at(found, parent[child], found[child])
+def subtree_any(parent: np.ndarray, flag: np.ndarray) -> np.ndarray:
+    """Return which chunks have a flagged chunk at or below them."""
+    above, found = parent, flag
+    while (above >= 0).any():
+        marked = above[(above >= 0) & found]
+        # Whoever is marked at this distance marks all between by the halves before.
+        found = found.copy()
+        found[marked] = True
+        above = np.where(above < 0, above, above[above])
     return found
 
 

@@ -1,8 +1,9 @@
 """Breach: break the marked bricks out of a wall with a cannon, and spare the rest.
 
-A brick wall in running bond stands on the world, along x. A cannon in front of it has
-a few shots; the ball is one free body, brought back to the muzzle for each. Bricks are
-numbered course by course from below, each course along x.
+A brick wall in running bond, or another asset, stands on the world, along x. A cannon
+in front of it has a few shots; the ball is one free body, brought back to the muzzle
+for each. Bricks are numbered course by course from below, each course along x. Of
+another asset the support chunks are the bricks, in its order.
 """
 
 import dataclasses
@@ -16,7 +17,8 @@ from brax.envs.base import Env, State
 
 from blastjax import chunks, graph, pytree, world
 from blastjax.author import shapes
-from blastjax.core import NONE
+from blastjax.author.mesh import Destructible
+from blastjax.core import NONE, WORLD, Asset
 from blastjax.rigid import bodies, scene
 
 ACTION_SIZE = 4
@@ -124,26 +126,53 @@ class Breach(Env):
     The episode ends when no marked brick is held, or the last shot has had its time.
     """
 
-    def __init__(self, config: Config | None = None, **changes: Any) -> None:
+    def __init__(
+        self,
+        config: Config | None = None,
+        *,
+        asset: Asset | Destructible | None = None,
+        collision: str | None = None,
+        **changes: Any,
+    ) -> None:
         """Build the scene.
 
         Args:
-          config: the settings; by default those of `Config`.
+          config: the settings; by default those of `Config`, or `fitted` to the asset.
+          asset: stands there instead of the wall, moved so that the middle of its foot
+            is the origin. It must be bonded to the world.
+          collision: how chunks collide, see `rigid.scene.build`; None takes hulls of an
+            asset with meshes, else boxes.
           **changes: fields of the config to change.
 
         Raises:
           ValueError: naming the field that is out of range, its value and the remedy.
         """
-        config = dataclasses.replace(config or Config(), **changes)
-        _check(config)
+        if config is None:
+            config = Config() if asset is None else fitted(asset)
+        config = dataclasses.replace(config, **changes)
+        position = np.zeros(3)
+        if asset is None:
+            asset = shapes.wall(config.bricks, config.courses, config.brick)
+            half = np.array([config.bricks, 1, 0]) * config.brick / 2
+            top = config.courses * config.brick[2]
+            self._low, self._high = -half, half + np.array([0, 0, top])
+        else:
+            low, high = _bounds(_bare(asset))
+            position = -np.array([low[0] + high[0], low[1] + high[1], 2 * low[2]]) / 2
+            self._low, self._high = low + position, high + position
+        if collision is None:
+            collision = "hull" if isinstance(asset, Destructible) else "box"
+        what, asset = asset, _bare(asset)
+        _check(config, self._high[1])
         self.config = config
-        asset = shapes.wall(config.bricks, config.courses, config.brick)
         self.scene = scene.build(
-            asset,
+            what,
             slots=config.slots,
+            position=position,
+            collision=collision,
             density=config.density,
             friction=config.friction,
-            model=_model(config),
+            model=_model(config, self._high[2]),
             timestep=config.timestep,
             iterations=config.iterations,
             max_contacts=config.max_contacts,
@@ -154,12 +183,17 @@ class Breach(Env):
         ball = self.scene.host.model.joint("ball")
         self._ball_qpos = int(ball.qposadr[0]) + np.arange(7)
         self._ball_dof = int(ball.dofadr[0]) + np.arange(6)
-        self._center = np.asarray(asset.chunk_centroid, np.float32)
-        self._volume = np.asarray(asset.chunk_volume, np.float32)
-        self._element = np.asarray(asset.chunk_element)
+        nodes = np.arange(1, len(asset.span_node))
+        self._element = nodes[np.asarray(asset.element_chunk)[nodes] != NONE]
+        brick = np.asarray(asset.element_chunk)[self._element]
+        self._center = np.asarray(asset.chunk_centroid + position, np.float32)[brick]
+        self._volume = np.asarray(asset.chunk_volume, np.float32)[brick]
+        self._half_height = np.asarray(asset.chunk_size, np.float32)[brick, 2]
         self._fixed_target = self._given_target()
         bonds = np.asarray(asset.bond_nodes)
-        self._bonds = np.bincount(bonds.ravel(), minlength=len(asset.span_node))
+        count = np.bincount(bonds.ravel(), minlength=len(asset.span_node))
+        # A piece that touches nothing has no bonds.
+        self._bonds = np.maximum(count, 1)
 
     @property
     def bricks(self) -> int:
@@ -266,10 +300,8 @@ class Breach(Env):
 
     def _extent(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the wall's lower and upper corner, (x, z) in m."""
-        config = self.config
-        half = config.bricks * config.brick[0] / 2
-        low = np.array([-half, 0.0], np.float32)
-        return low, np.array([half, config.courses * config.brick[2]], np.float32)
+        low, high = (x[[0, 2]].astype(np.float32) for x in (self._low, self._high))
+        return low, high
 
     def _fire(self, now: Round, action: jax.Array) -> tuple[Round, jax.Array]:
         """Return the round after a shot, if there is one, and whether there is."""
@@ -278,7 +310,8 @@ class Breach(Env):
         fires = ready & (action[3] > 0.0)
         low, high = self._extent()
         aim = low + (action[:2] + 1.0) / 2.0 * (high - low)
-        aim = jnp.stack([aim[0], jnp.asarray(-config.brick[1] / 2, aim.dtype), aim[1]])
+        front = jnp.asarray(self._low[1], aim.dtype)
+        aim = jnp.stack([aim[0], front, aim[1]])
         slowest, fastest = config.speed
         speed = slowest + (action[2] + 1.0) / 2.0 * (fastest - slowest)
 
@@ -367,9 +400,7 @@ class Breach(Env):
         pieces = graph.group_sum(volume, state.actor, volume.shape[0])
         place, _ = bodies.chunk_poses(scene_, moment.bodies, moment.data)
         sunk = self._center[:, 2] - place[self._element, 2]
-        fallen = (state.actor[self._element] == NONE) | (
-            sunk > self.config.brick[2] / 2
-        )
+        fallen = (state.actor[self._element] == NONE) | (sunk > self._half_height)
         metrics = {
             "actors": jnp.sum(chunks.active(asset, state)),
             "broken_bonds": jnp.sum(~state.bond_intact),
@@ -384,7 +415,57 @@ class Breach(Env):
         return {name: x.astype(jnp.float32) for name, x in metrics.items()}
 
 
-def _check(config: Config) -> None:
+def fitted(asset: Asset | Destructible) -> Config:
+    """Return settings for an asset that are to it as the defaults are to the wall.
+
+    Lengths go with its largest extent; masses, forces and impulses with its mass; speed
+    with the root of its size, as falls do. The timestep stays.
+    """
+    base, asset = Config(), _bare(asset)
+    low, high = _bounds(asset)
+    wall = np.prod(base.brick) * base.bricks * base.courses
+    nodes = np.asarray(asset.element_chunk)[: len(asset.span_node)]
+    volume = np.asarray(asset.chunk_volume, float)[nodes[nodes >= 0]].sum()
+    length = float((high - low).max() / (base.bricks * base.brick[0]))
+    mass = float(volume / wall)
+    lengths = (
+        *("target_radius", "min_radius", "max_radius", "ball_radius"),
+        *("distance", "muzzle_height"),
+    )
+    changes = {name: getattr(base, name) * length for name in lengths}
+    weights = ("threshold", "hardness", "ball_mass")
+    changes |= {name: getattr(base, name) * mass for name in weights}
+    slowest, fastest = (speed * length**0.5 for speed in base.speed)
+    changes["distance"] = max(
+        changes["distance"], changes["ball_radius"] * 2 + float(high[1] - low[1])
+    )
+    return dataclasses.replace(base, speed=(slowest, fastest), **changes)
+
+
+def _bare(asset: Asset | Destructible) -> Asset:
+    return asset.asset if isinstance(asset, Destructible) else asset
+
+
+def _bounds(asset: Asset) -> tuple[np.ndarray, np.ndarray]:
+    """Return the least and greatest corner of an asset's support chunks.
+
+    Raises:
+      ValueError: it is not bonded to the world.
+    """
+    nodes = np.asarray(asset.element_chunk)[: len(asset.span_node)]
+    if not asset.has_world or nodes[0] != WORLD:
+        raise ValueError(
+            "the asset is not bonded to the world, so all of it is free from the "
+            "start; add bonds to the world"
+        )
+    brick = nodes[nodes >= 0]
+    center, size = (
+        np.asarray(x, float)[brick] for x in (asset.chunk_centroid, asset.chunk_size)
+    )
+    return (center - size).min(axis=0), (center + size).max(axis=0)
+
+
+def _check(config: Config, half_depth: float) -> None:
     """Refuse a config that makes no environment.
 
     The wall and the scene check their own part.
@@ -417,19 +498,19 @@ def _check(config: Config) -> None:
         )
     if config.target is not None and not config.target:
         raise ValueError("target is empty; name a brick, or use None for a random one")
-    room = config.ball_radius + config.brick[1] / 2
+    room = config.ball_radius + half_depth
     if config.distance <= room:
         raise ValueError(
             f"distance is {config.distance}; the ball needs more than {room} m"
         )
 
 
-def _model(config: Config) -> str:
+def _model(config: Config, height: float) -> str:
     """Return the MJCF of the surroundings: floor, light, cannon and ball."""
     back, up, r = -config.distance, config.muzzle_height, config.ball_radius
     return f"""
 <mujoco>
-  <statistic center="0 0 {config.courses * config.brick[2] / 2}"/>
+  <statistic center="0 0 {height / 2}"/>
   <visual>
     <headlight ambient=".35 .35 .35" diffuse=".25 .25 .25" specular="0 0 0"/>
     <quality shadowsize="2048"/>

@@ -50,6 +50,8 @@ class Frames(pytree.Node):
     """(K + 1, 3) of the centre of mass, m."""
     quaternion: jax.Array
     """(K + 1, 4)."""
+    rotation: jax.Array
+    """(K + 1, 3, 3) the same as a matrix."""
     center: jax.Array
     """(K + 1, 3) the same point in the rest frame, m."""
     velocity: jax.Array
@@ -81,9 +83,11 @@ def frames(scene: Scene, bodies: Bodies, data: mjx.Data) -> Frames:
     turn = pose[:, 3:]
     square = jnp.sum(turn * turn, axis=1, keepdims=True)
     turn = turn * jax.lax.rsqrt(jnp.where(square > 0, square, 1.0))
+    turn = jnp.concatenate([turn, scene.quaternion[None]])
     return Frames(
         position=jnp.concatenate([pose[:, :3], scene.position[None]]),
-        quaternion=jnp.concatenate([turn, scene.quaternion[None]]),
+        quaternion=turn,
+        rotation=spatial.matrix(turn),
         center=jnp.concatenate([bodies.center, still]),
         velocity=jnp.concatenate([motion[:, :3], still]),
         spin=jnp.concatenate([motion[:, 3:], still]),

@@ -12,6 +12,10 @@ deep as they do when their grace ends, and only less deep from then on: a contac
 distance counts from there. Sizes: G geoms, K slots.
 """
 
+import dataclasses
+import itertools
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -20,7 +24,7 @@ from mujoco import mjx
 
 from blastjax import graph, pytree
 from blastjax.core import NONE
-from blastjax.rigid import engine, solver
+from blastjax.rigid import engine, hull
 from blastjax.rigid.bodies import Bodies
 from blastjax.rigid.scene import Scene
 
@@ -52,6 +56,16 @@ class Riders(pytree.Node):
     """(G,) int32 slot, K for what the world holds, NONE for the user's geoms."""
     active: jax.Array
     """(G,) bool, False for chunks of no actor."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Collider:
+    """How pairs of geoms collide."""
+
+    find: Callable[[mjx.Model, mjx.Data, jax.Array], engine.Points]
+    """Maps (model, data, pairs (n, 2)) to distance, position and frame."""
+    count: int
+    """Contacts that it finds for each pair, one pair's after the other's."""
 
 
 @pytree.dataclass
@@ -103,29 +117,18 @@ def collide(
         return data, Found(riders=carried, overlap=overlap, dropped=dropped)
     cap = engine.numeric(model, "max_geom_pairs")
     found: dict[int, list] = {}
-    for key, contacts, collider in engine.contact_groups(model, data):
-        kinds = (int(key.types[0]), int(key.types[1]))
-        meets = _meets(carried, bodies.grace, contacts.geom)
-        if kinds[0] not in _ENDLESS and contacts.geom.shape[0] > cap:
-            contacts, meets, lost = _nearest(model, data, contacts, meets, cap)
-            dropped = dropped.replace(pairs=dropped.pairs + lost)
-        if kinds == (_PLANE, _BOX):
-            points, count = _plane_box(model, data, contacts.geom), 4
-        else:
-            points = collider(model, data, key, contacts.geom)
-            count = collider.ncon  # type: ignore[attr-defined]
-        if count > 1:
-            contacts, meets = jax.tree.map(
-                lambda x, n=count: jnp.repeat(x, n, axis=0), (contacts, meets)
-            )
-        distance, position, frame = points
-        off = contacts.includemargin + _OFF
-        contacts = contacts.replace(
-            dist=jnp.where(meets, distance, off), pos=position, frame=frame
-        )
-        if kinds in scene.host.chunk_kinds:
-            contacts, overlap = _excuse_overlap(contacts, carried, bodies)
-        found.setdefault(key.condim, []).append(contacts)
+    for group, parameters in engine.contact_groups(model, data):
+        for rows, collider in _colliders(scene, group):
+            contacts = jax.tree.map(lambda x, rows=rows: x[rows], parameters)
+            meets = _meets(carried, bodies.grace, contacts.geom)
+            if group.types[0] not in _ENDLESS and len(rows) > cap:
+                contacts, meets, lost = _nearest(model, data, contacts, meets, cap)
+                dropped = dropped.replace(pairs=dropped.pairs + lost)
+            points = collider.find(model, data, contacts.geom)
+            contacts = _fill(contacts, meets, collider.count, points)
+            if group.types in scene.host.chunk_kinds:
+                contacts, overlap = _excuse_overlap(contacts, carried, bodies)
+            found.setdefault(group.condim, []).append(contacts)
 
     limit = engine.numeric(model, "max_contact_points")
     merged = []
@@ -140,40 +143,66 @@ def collide(
     return data, Found(riders=carried, overlap=overlap, dropped=dropped)
 
 
-def resolve(
-    model: mjx.Model, data: mjx.Data, search_steps: int
-) -> tuple[mjx.Data, solver.Report]:
-    """Solve for the acceleration and the constraint forces."""
-    impl = data._impl
-    if impl.efc_J.shape[0] == 0:
-        free = data.replace(qacc=data.qacc_smooth)
-        nothing = jnp.zeros((), data.qacc.dtype)
-        return free, solver.Report(nothing, jnp.zeros((), jnp.int32))
-    lower, upper = engine.row_bounds(data)
-    problem = solver.Problem(
-        inertia=engine.mass_matrix(model, data),
-        free=data.qacc_smooth,
-        jacobian=impl.efc_J,
-        stiffness=impl.efc_D,
-        reference=impl.efc_aref,
-        lower=lower,
-        upper=upper,
-    )
-    acceleration, force, report = solver.solve(
-        problem,
-        data.qacc_warmstart,
-        model.opt.tolerance,
-        iterations=model.opt.iterations,
-        search_steps=search_steps,
-    )
-    data = data.tree_replace(
-        {
-            "qacc": acceleration,
-            "qfrc_constraint": impl.efc_J.T @ force,
-            "_impl.efc_force": force,
-        }
-    )
-    return data, report
+def make_data(scene: Scene) -> mjx.Data:
+    """Return data at the model's start, with room for what the colliders find."""
+    model = scene.model
+    data = mjx.make_data(model, impl="jax")
+    if data._impl.ncon == 0:
+        return data
+    cap = engine.numeric(model, "max_geom_pairs")
+    counts: dict[int, int] = {}
+    for group, _ in engine.contact_groups(model, data):
+        for rows, collider in _colliders(scene, group):
+            pairs = len(rows) if group.types[0] in _ENDLESS else min(len(rows), cap)
+            counts[group.condim] = counts.get(group.condim, 0) + pairs * collider.count
+    limit = engine.numeric(model, "max_contact_points")
+    return engine.make_data(model, {c: min(n, limit) for c, n in counts.items()})
+
+
+def _colliders(scene: Scene, group: engine.Group) -> list[tuple[np.ndarray, Collider]]:
+    """Return which rows of a group collide by what."""
+    chunk = scene.host.geom_element[group.pair] >= 0
+    table = None if scene.hulls is None else hull.colliders(scene.hulls)
+    parts: dict[Collider, list] = {}
+    for first, second in itertools.product((False, True), repeat=2):
+        sides = first, second
+        rows = np.flatnonzero((chunk == sides).all(axis=1))
+        if rows.size:
+            how = _collider(group, sides, table)
+            parts.setdefault(how, []).append(rows)
+    return [(np.sort(np.concatenate(rows)), how) for how, rows in parts.items()]
+
+
+def _collider(
+    group: engine.Group,
+    sides: tuple[bool, bool],
+    table: dict[int, tuple[hull.Find, int]] | None,
+) -> Collider:
+    """Return how pairs of a group collide whose first or second geom is a chunk.
+
+    A shape that MJX does not know is one more function (model, data, pairs) here.
+    """
+    if table is not None and any(sides):
+        # A hull is a box to MJX; the other geom's type says how they meet.
+        other = group.types[1] if sides[0] else group.types[0]
+        return Collider(*table[other])
+    if group.types == (_PLANE, _BOX):
+        return Collider(_plane_box, 4)
+    return Collider(group.find, group.count)
+
+
+def _fill(
+    contacts: mjx.Contact, meets: jax.Array, count: int, points: engine.Points
+) -> mjx.Contact:
+    """Put what a collider found, count points a pair, into the pairs' contacts."""
+    if count > 1:
+        contacts, meets = jax.tree.map(
+            lambda x: jnp.repeat(x, count, axis=0), (contacts, meets)
+        )
+    distance, position, frame = points
+    off = contacts.includemargin + _OFF
+    distance = jnp.where(meets, distance, off)
+    return contacts.replace(dist=distance, pos=position, frame=frame)
 
 
 def normal_force(data: mjx.Data) -> jax.Array:
@@ -234,9 +263,7 @@ def _nearest(
     return contacts, near, lost
 
 
-def _plane_box(
-    model: mjx.Model, data: mjx.Data, pair: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _plane_box(model: mjx.Model, data: mjx.Data, pair: jax.Array) -> engine.Points:
     """Collide planes with boxes by MuJoCo C's rule, four contacts a pair.
 
     These are the corners below the box's centre along the normal. Of two opposite

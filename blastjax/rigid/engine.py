@@ -6,8 +6,9 @@ between releases, so they are all called here, and `tests/test_rigid.py` watches
 Every function maps (model, data) to data, as MJX's do.
 """
 
+import dataclasses
+import functools
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -24,8 +25,14 @@ from mujoco.mjx._src import (
 )
 from mujoco.mjx._src import math as mjx_math
 
-Collider = Callable[..., tuple[jax.Array, jax.Array, jax.Array]]
+from blastjax.rigid import solver
 
+Points = tuple[jax.Array, jax.Array, jax.Array]
+"""Distance (n,) m, position (n, 3) m and frame (n, 3, 3) of contacts."""
+
+LEAST = mujoco.mjMINVAL
+"""Least softness of a constraint."""
+_ROWS = ("D", "aref", "pos", "margin", "frictionloss")
 _UPPER = ((0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2))
 
 
@@ -78,17 +85,77 @@ def geom_pairs(model: mujoco.MjModel) -> np.ndarray:
     return np.array(pairs, dtype=int).reshape(-1, 2)
 
 
-def contact_groups(model: mjx.Model, data: mjx.Data) -> list[tuple[Any, Any, Collider]]:
-    """Return (key, contacts, collider) for each kind of geom pair in the model.
+@dataclasses.dataclass(frozen=True)
+class Group:
+    """The pairs of geoms of one kind, on the host."""
 
-    The contacts have their parameters and their two geoms, one row a pair; distance,
-    position and frame are for the collider to find.
+    types: tuple[int, int]
+    """Types of the two geoms."""
+    condim: int
+    """Dimension of their contacts."""
+    pair: np.ndarray
+    """(pairs, 2) geoms."""
+    count: int
+    """Contacts that MJX finds for a pair."""
+    find: Callable[[mjx.Model, mjx.Data, jax.Array], Points]
+    """MJX's collider: of pairs (n, 2) it finds count contacts each."""
+
+
+def contact_groups(model: mjx.Model, data: mjx.Data) -> list[tuple[Group, mjx.Contact]]:
+    """Return the kinds of geom pairs in the model, with their contacts' parameters.
+
+    The contacts have one row a pair; distance, position and frame are for a collider to
+    find.
     """
-    groups = collision_driver._contact_groups(model, data)
-    return [
-        (key, contacts, collision_driver._COLLISION_FUNC[key.types])
-        for key, contacts in groups.items()
-    ]
+    pairs = collision_driver._geom_groups(model)
+    found = []
+    for key, contacts in collision_driver._contact_groups(model, data).items():
+        collider = collision_driver._COLLISION_FUNC[key.types]
+        group = Group(
+            types=(int(key.types[0]), int(key.types[1])),
+            condim=int(key.condim),
+            pair=np.array(pairs[key])[:, :2],
+            count=collider.ncon,
+            find=_with_key(collider, key),
+        )
+        found.append((group, contacts))
+    return found
+
+
+def make_data(model: mjx.Model, contacts: dict[int, int]) -> mjx.Data:
+    """Return data at the model's start, with so many contacts of each dimension.
+
+    MJX counts those that its own colliders find; ours may find more or fewer.
+    """
+    data = mjx.make_data(model, impl="jax")
+    impl = data._impl
+    dim = np.array([c for c in sorted(contacts) for _ in range(contacts[c])], int)
+    if np.array_equal(dim, impl.contact.dim):
+        return data
+    kind = constraint.make_efc_type(model, dim)
+    rows, count = kind.size, dim.size
+
+    def sized(x: jax.Array, length: int) -> jax.Array:
+        return jnp.zeros((length, *x.shape[1:]), x.dtype)
+
+    touch = jax.tree.map(lambda x: sized(x, count), impl.contact)
+    touch = touch.replace(
+        dim=dim,
+        efc_address=constraint.make_efc_address(model, dim, kind),
+    )
+    names = [f.name for f in dataclasses.fields(impl) if f.name.startswith("efc_")]
+    arrays = [n for n in names if isinstance(getattr(impl, n), jax.Array)]
+    changed = {f"_impl.{n}": sized(getattr(impl, n), rows) for n in arrays}
+    changed |= {"_impl.contact": touch, "_impl.efc_type": kind}
+    return data.tree_replace(
+        {**changed, "_impl.nefc": int(rows), "_impl.ncon": int(count)}
+    )
+
+
+def _with_key(
+    collider: Callable[..., Points], key: collision_driver.FunctionKey
+) -> Callable[[mjx.Model, mjx.Data, jax.Array], Points]:
+    return lambda model, data, pair: collider(model, data, key, pair)
 
 
 def contact_frame(normal: jax.Array) -> jax.Array:
@@ -96,11 +163,60 @@ def contact_frame(normal: jax.Array) -> jax.Array:
     return mjx_math.make_frame(normal)
 
 
-def constraint_rows(model: mjx.Model, data: mjx.Data, geom_body: jax.Array) -> mjx.Data:
-    """Write the constraint rows, with the geoms on the given bodies (G,)."""
-    # `geom_bodyid` is metadata of the model: a traced copy must not cross a jit, vmap
-    # or scan boundary, so it exists for this one call.
-    return constraint.make_constraint(model.replace(geom_bodyid=geom_body), data)
+def contacts_by_size(data: mjx.Data) -> list[tuple[int, mjx.Contact]]:
+    """Return (dimension, contacts) for each dimension of contacts that there is."""
+    contacts = data._impl.contact
+    found = []
+    for size in sorted(set(contacts.dim.tolist())):
+        rows = np.flatnonzero(contacts.dim == size)
+        part = slice(rows[0], rows[-1] + 1)
+        found.append((size, jax.tree.map(lambda x, part=part: x[part], contacts)))
+    return found
+
+
+def impedance(
+    model: mjx.Model, reference: jax.Array, impedance: jax.Array, depth: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Return spring, damping and impedance of contacts: (n,) of solref and solimp."""
+    return jax.vmap(functools.partial(constraint._kbi, model))(
+        reference, impedance, depth
+    )
+
+
+def point_jacobian(
+    model: mjx.Model, data: mjx.Data, point: jax.Array, body: jax.Array, count: int
+) -> tuple[jax.Array, jax.Array]:
+    """Return how points (n, 3) on bodies (n,) move and turn, each (n, count, 3).
+
+    By the first `count` degrees of freedom.
+    """
+    linear, angular = jax.vmap(functools.partial(support.jac, model, data))(point, body)
+    return linear[:, :count], angular[:, :count]
+
+
+def user_rows(model: mjx.Model, data: mjx.Data, count: int) -> solver.Rows | None:
+    """Return the constraints that are no contacts, on the first `count` joints.
+
+    Equality rows pull and push, dry friction is bounded, limits only push; a force is
+    counted as minus the derivative of the cost, so pushing is the lower side.
+    """
+    impl = data._impl
+    equality, dry = impl.ne, impl.nf
+    if equality + dry + impl.nl == 0:
+        return None
+    alone = data.tree_replace({"_impl.contact.dim": np.zeros(0, int)})
+    made = constraint.make_constraint(model, alone)._impl
+    friction = made.efc_frictionloss
+    row = np.arange(friction.shape[0])
+    pulls, rubs = row < equality, (row >= equality) & (row < equality + dry)
+    endless = jnp.full_like(friction, jnp.inf)
+    return solver.Rows(
+        jacobian=made.efc_J[:, :count],
+        stiffness=made.efc_D,
+        reference=made.efc_aref,
+        lower=jnp.where(rubs, -friction, -endless),
+        upper=jnp.where(pulls, endless, jnp.where(rubs, friction, 0.0)),
+    )
 
 
 def smooth_acceleration(
@@ -121,6 +237,7 @@ def without_matrices(data: mjx.Data) -> mjx.Data:
     return data.tree_replace(
         {
             "_impl.efc_J": jnp.zeros((0, data.qvel.shape[0]), impl.efc_J.dtype),
+            **{f"_impl.efc_{name}": jnp.zeros(0, data.qvel.dtype) for name in _ROWS},
             "_impl.M": jnp.zeros((0,) * impl.M.ndim, impl.M.dtype),
             "_impl.qLD": jnp.zeros((0,) * impl.qLD.ndim, impl.qLD.dtype),
         }
@@ -137,23 +254,6 @@ def mass_matrix(model: mjx.Model, data: mjx.Data) -> jax.Array:
     return support.full_m(model, data)
 
 
-def row_bounds(data: mjx.Data) -> tuple[jax.Array, jax.Array]:
-    """Return the least and the greatest force of each constraint row, both (R,).
-
-    Equality rows pull and push, dry friction is bounded, the others only push; a force
-    is counted as minus the derivative of the cost, so pushing is the lower side.
-    """
-    impl = data._impl
-    count = impl.efc_J.shape[0]
-    friction = impl.efc_frictionloss
-    row = np.arange(count)
-    equality, dry = row < impl.ne, (row >= impl.ne) & (row < impl.ne + impl.nf)
-    endless = jnp.full_like(friction, jnp.inf)
-    lower = jnp.where(dry, -friction, -endless)
-    upper = jnp.where(equality, endless, jnp.where(dry, friction, 0.0))
-    return lower, upper
-
-
 def normal_force(data: mjx.Data) -> jax.Array:
     """Return the normal force of each contact from its rows' forces, (contacts,) N."""
     impl = data._impl
@@ -167,6 +267,30 @@ def normal_force(data: mjx.Data) -> jax.Array:
         parts.append(block.reshape(count, rows).sum(axis=1))
         start += count * rows
     return jnp.concatenate(parts)
+
+
+def contact_force(data: mjx.Data) -> jax.Array:
+    """Return the force of each contact on its second geom, (contacts, 3) N, world axes.
+
+    Friction of rolling and twisting is left out.
+    """
+    impl = data._impl
+    touch, start = impl.contact, impl.ne + impl.nf + impl.nl
+    parts = []
+    for size in (1, 3, 4, 6):
+        count = int(np.sum(touch.dim == size))
+        rows = 1 if size == 1 else 2 * (size - 1)
+        block = impl.efc_force[start : start + count * rows].reshape(count, rows)
+        start += count * rows
+        local = jnp.zeros((count, 3), block.dtype).at[:, 0].set(block.sum(axis=1))
+        if size > 1:
+            # Opposite edges of the pyramid: their difference is the friction.
+            edges = block[:, :4].reshape(count, 2, 2)
+            local = local.at[:, 1:].set(edges[..., 0] - edges[..., 1])
+        parts.append(local)
+    local = jnp.concatenate(parts)
+    local = local.at[:, 1:].multiply(touch.friction[:, :2])
+    return jnp.einsum("ni,nij->nj", local, touch.frame)
 
 
 def integrate(model: mjx.Model, data: mjx.Data) -> mjx.Data:

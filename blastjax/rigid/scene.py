@@ -1,8 +1,10 @@
 """Scenes: a breakable asset put into the user's own MuJoCo model, on the host.
 
 The user's bodies, joints and actuators keep their ids and addresses: what the library
-adds comes after them. It adds one mocap body `chunk<element>` with one geom for every
-chunk that can collide, and K free bodies `slot<k>` without geoms. Sizes: K slots, A
+adds comes after them. It adds one mocap body `chunk<element>` for every chunk that can
+collide, with one geom or as many as it has hulls, and K free bodies `slot<k>` without
+geoms. To MJX a hull is a box around it, which sorts all pairs of hulls into one kind;
+`hull` then collides what is inside. Sizes: K slots, A
 elements, G geoms, V degrees of freedom, E elements that have a chunk.
 """
 
@@ -17,10 +19,13 @@ import numpy as np
 from mujoco import mjx
 
 from blastjax import pytree
+from blastjax.author.hulls import Hulls, fit
+from blastjax.author.mesh import Destructible
 from blastjax.core import Asset
-from blastjax.rigid import engine
+from blastjax.rigid import engine, tables
+from blastjax.rigid.hull import Table
 
-BOX, SPHERE = "box", "sphere"
+BOX, SPHERE, HULL = "box", "sphere", "hull"
 
 _DEFAULT_MODEL = """
 <mujoco>
@@ -37,17 +42,16 @@ class Host:
     """What a scene keeps on the host, hashed by identity: never copied or compared."""
 
     model: mujoco.MjModel
-    """The compiled model, for rendering and for MuJoCo C."""
+    """The compiled model, for rendering and for MuJoCo C; chunks with meshes have them
+    as geoms in it."""
     slot_body: np.ndarray
     """(K,) body of each slot."""
     slot_qpos: np.ndarray
     """(K, 7) addresses of each slot's position and quaternion."""
     slot_dof: np.ndarray
     """(K, 6) addresses of each slot's linear and angular velocity."""
-    geom: np.ndarray
-    """(E,) geom of each chunk that can collide."""
     mocap: np.ndarray
-    """(E,) mocap body, by mocap id, of each of them."""
+    """(E,) mocap body, by mocap id, of each chunk that can collide."""
     element: np.ndarray
     """(E,) element of each of them."""
     geom_element: np.ndarray
@@ -58,6 +62,8 @@ class Host:
     """Sides of a contact, 0 and 1, on which a chunk can be."""
     chunk_kinds: frozenset[tuple[int, int]]
     """Types of geoms of which two chunks can collide: one pair of types or none."""
+    user_meets: bool
+    """Whether a geom of the user's that moves can collide."""
 
 
 @pytree.dataclass
@@ -74,6 +80,8 @@ class Scene(pytree.Node):
     """(4,) how it starts, w first."""
     density: jax.Array
     """() or (C,) density, kg/m^3."""
+    hulls: Table | None
+    """Convex hulls of the geoms, or None where chunks are boxes or spheres."""
     host: Host = pytree.static()
     """The compiled model and the addresses of what was added to it."""
     line_search: int = pytree.static()
@@ -84,9 +92,14 @@ class Scene(pytree.Node):
         """K, how many actors can move at a time."""
         return len(self.host.slot_body)
 
+    @property
+    def users(self) -> int:
+        """U, degrees of freedom of the user's model, before those of the slots."""
+        return self.model.nv - 6 * self.slots
+
 
 def build(
-    asset: Asset,
+    asset: Asset | Destructible,
     *,
     slots: int = 8,
     position: Any = (0.0, 0.0, 0.0),
@@ -94,6 +107,7 @@ def build(
     density: Any = 1000.0,
     friction: float = 1.0,
     collision: str = BOX,
+    hulls: Hulls | None = None,
     chunk_contacts: bool = True,
     model: str | os.PathLike[str] | mujoco.MjSpec | None = None,
     timestep: float | None = None,
@@ -106,7 +120,7 @@ def build(
     """Put an asset into a model.
 
     Args:
-      asset: concrete, not traced.
+      asset: concrete, not traced. Of a Destructible the meshes are drawn.
       slots: K, most actors that move at a time. Beyond them the lightest become debris.
         More slots than chunks are never needed and not made.
       position: (3,) of the asset's rest frame, m.
@@ -114,7 +128,9 @@ def build(
       density: kg/m^3, one for all or (C,).
       friction: sliding friction of the chunks.
       collision: "box", each chunk collides as a box of its half extents; "sphere", as
-        the largest ball in that box: cheaper, and it rolls.
+        the largest ball in that box: cheaper, and it rolls; "hull", as the convex hull
+        of its mesh.
+      hulls: of the chunks, for "hull"; by default `author.hulls.fit` of a Destructible.
       chunk_contacts: whether chunks of different actors collide. Without, no such pair
         is in the program at all.
       model: MJCF as a string, a path or an MjSpec (left as it is). By default a floor.
@@ -143,8 +159,16 @@ def build(
         )
     if slots < 1:
         raise ValueError(f"slots is {slots}; an actor needs at least 1 slot to move in")
-    if collision not in (BOX, SPHERE):
-        raise ValueError(f"collision is {collision!r}; use 'box' or 'sphere'")
+    meshes = asset.meshes if isinstance(asset, Destructible) else None
+    if collision == HULL:
+        hulls = _hulls(asset, hulls)
+    elif hulls is not None or collision not in (BOX, SPHERE):
+        given = "with hulls" if hulls is not None else "unknown"
+        raise ValueError(
+            f"collision is {collision!r}, {given}; use 'hull', or 'box' or 'sphere' "
+            "without hulls"
+        )
+    asset = asset.asset if isinstance(asset, Destructible) else asset
     _positive("friction", friction, zero=True)
     for name, cap in (("max_pairs", max_pairs), ("max_contacts", max_contacts)):
         if cap is not None and cap < 1:
@@ -167,9 +191,11 @@ def build(
         spec.option.tolerance = tolerance
     spec.option.iterations = iterations
     bits = (1, 1) if chunk_contacts else _bits_without_chunk_pairs(spec)
-    _add_chunks(spec, asset, elements, place, turn / length, collision, friction, bits)
+    shapes = _chunk_shapes(asset, elements, collision, hulls)
+    _add_chunks(spec, asset, elements, place, turn / length, shapes, friction, bits)
     _add_slots(spec, slots)
-    _cap(spec, "max_geom_pairs", max_pairs or max(64, 2 * len(elements)))
+    count = sum(len(sizes) for _, sizes in shapes.values())
+    _cap(spec, "max_geom_pairs", max_pairs or max(64, 2 * count))
     _cap(spec, "max_contact_points", max_contacts or 16 * (slots + 1))
     compiled = spec.compile()
     # MJX would factor the inertia a second time at each step to damp nothing.
@@ -178,6 +204,16 @@ def build(
 
     device = mjx.put_model(compiled, impl="jax")
     dtype = device.qpos0.dtype
+    addresses = _host(compiled, slots, elements)
+    table = None
+    if hulls is not None:
+        table, reach = tables.of_geoms(compiled, addresses.geom_element, asset, hulls)
+        device = device.replace(geom_rbound=jnp.asarray(reach, dtype))
+    if meshes is not None or hulls is not None:
+        solids = tables.solids(asset, elements, meshes, hulls)
+        drawn = tables.with_meshes(spec, solids)
+        drawn.opt.disableflags = compiled.opt.disableflags
+        addresses = dataclasses.replace(addresses, model=drawn)
 
     def cast(x: Any) -> jax.Array:
         x = jnp.asarray(x)
@@ -189,9 +225,26 @@ def build(
         position=cast(place),
         quaternion=cast(turn / length),
         density=cast(weight),
-        host=_host(compiled, slots, elements),
+        hulls=jax.tree.map(cast, table),
+        host=addresses,
         line_search=line_search,
     )
+
+
+def _hulls(asset: Asset | Destructible, hulls: Hulls | None) -> Hulls:
+    if hulls is None:
+        if isinstance(asset, Destructible):
+            return fit(asset)
+        raise ValueError(
+            "collision is 'hull', and an asset alone has no shapes: pass a "
+            "Destructible, or hulls"
+        )
+    asset = asset.asset if isinstance(asset, Destructible) else asset
+    chunk = np.asarray(asset.element_chunk)
+    bare = np.setdiff1d(chunk[chunk >= 0], hulls.chunk)
+    if bare.size:
+        raise ValueError(f"chunk {bare[0]} has no hull; fit hulls to this asset")
+    return hulls
 
 
 def _vector(name: str, value: Any, size: int) -> np.ndarray:
@@ -307,42 +360,53 @@ def _bits_without_chunk_pairs(spec: mujoco.MjSpec) -> tuple[int, int]:
     )
 
 
+def _chunk_shapes(
+    asset: Asset, elements: np.ndarray, collision: str, hulls: Hulls | None
+) -> dict[int, tuple[int, np.ndarray]]:
+    """Return type and sizes (geoms, 3) of each element's geoms, as MJX sees them."""
+    chunk = np.asarray(asset.element_chunk)
+    size = np.asarray(asset.chunk_size, dtype=float)
+    box, sphere = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_SPHERE
+    if hulls is not None:
+        reach = np.abs(hulls.vertices).max(axis=1)
+        return {e: (box, reach[hulls.chunk == chunk[e]]) for e in elements}
+    if collision == SPHERE:
+        return {e: (sphere, np.full((1, 3), size[chunk[e]].min())) for e in elements}
+    return {e: (box, size[chunk[e]][None]) for e in elements}
+
+
 def _add_chunks(
     spec: mujoco.MjSpec,
     asset: Asset,
     elements: np.ndarray,
     place: np.ndarray,
     turn: np.ndarray,
-    collision: str,
+    shapes: dict[int, tuple[int, np.ndarray]],
     friction: float,
     bits: tuple[int, int],
 ) -> None:
-    chunk = np.asarray(asset.element_chunk)
-    size = np.asarray(asset.chunk_size, dtype=float)
     center = np.asarray(asset.chunk_centroid, dtype=float)
+    center = center[np.asarray(asset.element_chunk)]
     matrix = np.zeros(9)
     mujoco.mju_quat2Mat(matrix, turn)
     for element in elements:
-        c = chunk[element]
-        extents = size[c] if collision == BOX else np.full(3, size[c].min())
-        kind = mujoco.mjtGeom.mjGEOM_BOX
-        if collision == SPHERE:
-            kind = mujoco.mjtGeom.mjGEOM_SPHERE
         body = spec.worldbody.add_body(
             name=f"chunk{element}",
             mocap=True,
-            pos=place + matrix.reshape(3, 3) @ center[c],
+            pos=place + matrix.reshape(3, 3) @ center[element],
             quat=turn,
         )
-        body.add_geom(
-            name=f"chunk{element}",
-            type=kind,
-            size=extents,
-            friction=[friction, 0.005, 0.0001],
-            contype=bits[0],
-            conaffinity=bits[1],
-            condim=3,
-        )
+        kind, sizes = shapes[element]
+        for i, size in enumerate(sizes):
+            body.add_geom(
+                name=f"chunk{element}" + (f".{i}" if i else ""),
+                type=kind,
+                size=size,
+                friction=[friction, 0.005, 0.0001],
+                contype=bits[0],
+                conaffinity=bits[1],
+                condim=3,
+            )
 
 
 def _add_slots(spec: mujoco.MjSpec, slots: int) -> None:
@@ -373,20 +437,20 @@ def _host(model: mujoco.MjModel, slots: int, elements: np.ndarray) -> Host:
     slot_body = np.array([body(f"slot{k}") for k in range(slots)])
     joint = model.body_jntadr[slot_body]
     chunk_body = np.array([body(f"chunk{e}") for e in elements])
-    geom = model.body_geomadr[chunk_body]
-    geom_element = np.full(model.ngeom, -1)
-    geom_element[geom] = elements
+    body_element = np.full(model.nbody, -1)
+    body_element[chunk_body] = elements
+    geom_element = body_element[model.geom_bodyid]
     pairs = engine.geom_pairs(model)
+    weld = model.body_weldid[model.geom_bodyid]
     return Host(
         model=model,
         slot_body=slot_body,
         slot_qpos=model.jnt_qposadr[joint][:, None] + np.arange(7),
         slot_dof=model.jnt_dofadr[joint][:, None] + np.arange(6),
-        geom=geom,
         mocap=model.body_mocapid[chunk_body],
         element=elements,
         geom_element=geom_element,
-        geom_weld=model.body_weldid[model.geom_bodyid],
+        geom_weld=weld,
         chunk_sides=tuple(
             side for side in (0, 1) if (geom_element[pairs[:, side]] >= 0).any()
         ),
@@ -394,4 +458,5 @@ def _host(model: mujoco.MjModel, slots: int, elements: np.ndarray) -> Host:
             (int(model.geom_type[a]), int(model.geom_type[b]))
             for a, b in pairs[(geom_element[pairs] >= 0).all(axis=1)]
         ),
+        user_meets=bool(((geom_element[pairs] < 0) & (weld[pairs] > 0)).any()),
     )

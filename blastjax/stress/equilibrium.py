@@ -34,12 +34,12 @@ LEAST_AGGREGATE = 6
 """Nodes of an aggregate at least."""
 CLUSTER = 8
 """Most nodes that the smoother solves for together."""
-CLUSTER_SHIFT = 30.0
-"""Roundings added to the unit diagonal of a cluster's matrix."""
+COARSE_SHIFT = 8.0
+"""Roundings added to the unit diagonal of the coarse matrix."""
+NULL_PIVOT = 4.0
+"""Roundings of a unit diagonal, up to which what elimination left of it is nothing."""
 DAMPING = 2 / 3
 """Of the smoother, which overshoots by a factor of 2 at most."""
-COARSE_SHIFTS = (8.0, 256.0, 8192.0)
-"""Roundings added to the coarse matrix's unit diagonal: the least that serves."""
 NOISE = 30
 """Roundings of its load up to which a piece counts as unloaded."""
 STALE_STEPS = 20
@@ -305,7 +305,10 @@ def solve(
     dtype = asset.chunk_centroid.dtype
     if tolerance is None:
         tolerance = 1e-10 if dtype == jnp.float64 else 1e-6
+    if not asset.bond_area.shape[0]:
+        return _nothing(dtype)
     frame = _frame(structure, asset, state)
+    load, peak = _unit_load(load, frame)
     right = _balanced(frame, structure, load)
     scale = jax.lax.stop_gradient(_size(right))
     scale = jnp.where(scale > 0, scale, 1.0)
@@ -339,15 +342,31 @@ def solve(
         symmetric=True,
         has_aux=True,
     )
-    bond = scale * frame.root * strain
+    bond = frame.root * strain * scale * jnp.where(jnp.isfinite(peak), peak, 0)
+    # A load that is no number, or too large for one, bears no answer.
+    fits = jnp.isfinite(peak) & jnp.isfinite(jnp.max(jnp.abs(bond)))
+    bond = jnp.where(fits, bond, 0)
     return Solution(
         force=bond[:, :3],
         torque=bond[:, 3:] * frame.length,
-        residual=residual,
+        residual=jnp.where(fits, residual, jnp.inf),
         iterations=count,
-        converged=residual <= tolerance,
+        converged=fits & (residual <= tolerance),
         strain=strain,
         carries=frame.alive,
+    )
+
+
+def _nothing(dtype: Any) -> Solution:
+    """Return the solution of an asset without bonds."""
+    return Solution(
+        force=jnp.zeros((0, 3), dtype),
+        torque=jnp.zeros((0, 3), dtype),
+        residual=jnp.zeros((), dtype),
+        iterations=jnp.zeros((), jnp.int32),
+        converged=jnp.ones((), bool),
+        strain=jnp.zeros((0, 6), dtype),
+        carries=jnp.zeros(0, bool),
     )
 
 
@@ -414,6 +433,20 @@ def _frame(structure: Structure, asset: Asset, state: State) -> _Frame:
         floats=is_chunk & ~held,
         length=length,
     )
+
+
+def _unit_load(load: Load, frame: _Frame) -> tuple[Load, jax.Array]:
+    """Return a load of largest entry 1, whose square is a number, and what it was."""
+    both = jnp.stack([load.force, load.torque / frame.length])
+    both = jnp.where(frame.bears[None, :, None], both, 0)
+    peak = jax.lax.stop_gradient(jnp.max(jnp.abs(both)))
+    scale = jnp.where(jnp.isfinite(peak) & (peak > 0), peak, 1)
+
+    def unit(x: jax.Array) -> jax.Array:
+        x = jnp.where(frame.bears[:, None] & jnp.isfinite(x), x, 0)
+        return x / scale
+
+    return Load(force=unit(load.force), torque=unit(load.torque)), peak
 
 
 def _rows(values: jax.Array, index: jax.Array) -> jax.Array:
@@ -487,15 +520,19 @@ def _balanced(frame: _Frame, structure: Structure, load: Load) -> jax.Array:
 
 
 def _solve_3x3(matrix: jax.Array, right: jax.Array) -> jax.Array:
-    """Solve (n, 3, 3) x = (n, 3) by cofactors; 0 where the matrix is singular."""
+    """Solve (n, 3, 3) x = (n, 3); 0 where the matrix is singular."""
     scale = jax.lax.stop_gradient(jnp.max(jnp.abs(matrix), axis=(1, 2)))
     scale = jnp.where(scale > 0, scale, 1)
-    matrix = matrix / scale[:, None, None]
+    inverse = _inverse_3x3(matrix / scale[:, None, None])
+    return jnp.einsum("nij,nj->ni", inverse, right / scale[:, None])
+
+
+def _inverse_3x3(matrix: jax.Array) -> jax.Array:
+    """Invert matrices (n, 3, 3) by cofactors; 0 where they are singular."""
     a, b, c = matrix[:, 0], matrix[:, 1], matrix[:, 2]
     cofactors = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)], axis=-1)
     determinant = spatial.dot(a, jnp.cross(b, c))
-    inverse = spatial.ratio(cofactors, determinant[:, None, None])
-    return jnp.einsum("nij,nj->ni", inverse, right / scale[:, None])
+    return spatial.ratio(cofactors, determinant[:, None, None])
 
 
 Target = tuple[jax.Array, jax.Array]
@@ -607,9 +644,7 @@ def _smoother(frame: _Frame, structure: Structure) -> Any:
     used = diagonal > 0
     unit = jnp.where(used, jax.lax.rsqrt(jnp.where(used, diagonal, 1)), 0)
     matrix = unit[:, :, None] * matrix * unit[:, None, :]
-    shift = jnp.where(used, CLUSTER_SHIFT * jnp.finfo(matrix.dtype).eps, 1)
-    eye = jnp.eye(6 * size, dtype=matrix.dtype)[None]
-    inverse = jnp.linalg.inv(matrix + shift.astype(matrix.dtype)[:, :, None] * eye)
+    inverse = _inverse(matrix)
     inverse = unit[:, :, None] * inverse * unit[:, None, :]
 
     def smooth(residual: jax.Array) -> jax.Array:
@@ -618,6 +653,49 @@ def _smoother(frame: _Frame, structure: Structure) -> Any:
         return jnp.zeros_like(residual).at[nodes].set(answer, mode="drop")
 
     return smooth
+
+
+def _inverse(matrix: jax.Array) -> jax.Array:
+    """Invert semidefinite matrices (m, 6 n, 6 n) of unit diagonal, six rows at a time.
+
+    Rows that depend on those before, but for rounding, are left out: zero in the
+    inverse, which is thus never indefinite.
+
+    Not by LAPACK: on a CPU, JAX's calls of it hand parts of large batches to the thread
+    pool that they occupy themselves. As many calls side by side as there are threads
+    wait for ever.
+    """
+    rows = jnp.arange(matrix.shape[-1], dtype=jnp.int32) // 6
+
+    def sweep(k: jax.Array, matrix: jax.Array) -> jax.Array:
+        mine = rows == k
+        row = jax.lax.dynamic_slice_in_dim(matrix, 6 * k, 6, 1)
+        column = jax.lax.dynamic_slice_in_dim(matrix, 6 * k, 6, 2)
+        pivot = _inverse_6x6(jax.lax.dynamic_slice_in_dim(row, 6 * k, 6, 2))
+        row = pivot @ jnp.where(mine[None, None], 0, row)
+        column = jnp.where(mine[None, :, None], 0, column)
+        matrix = matrix - column @ row
+        matrix = jax.lax.dynamic_update_slice_in_dim(matrix, row, 6 * k, 1)
+        pivots = jnp.tile(pivot, (1, rows.shape[0] // 6, 1))
+        column = jnp.where(mine[None, :, None], pivots, -(column @ pivot))
+        return jax.lax.dynamic_update_slice_in_dim(matrix, column, 6 * k, 2)
+
+    return jax.lax.fori_loop(0, rows.shape[0] // 6, sweep, matrix)
+
+
+def _inverse_6x6(matrix: jax.Array) -> jax.Array:
+    """Invert semidefinite matrices (m, 6, 6), dependent rows left out."""
+    least = NULL_PIVOT * jnp.finfo(matrix.dtype).eps
+    for k in range(6):
+        mine = jnp.arange(6, dtype=jnp.int32) == k
+        pivot = matrix[:, k, k]
+        pivot = jnp.where(pivot > least, 1 / jnp.where(pivot > least, pivot, 1), 0)
+        row = jnp.where(mine[None], 1, pivot[:, None] * matrix[:, k])
+        column = jnp.where(mine[None], -1, matrix[:, :, k])
+        row = jnp.where(mine[None], pivot[:, None], row)
+        rest = jnp.where(mine[None, :, None] | mine[None, None], 0, matrix)
+        matrix = rest - column[:, :, None] * row[:, None]
+    return matrix
 
 
 def _bond_blocks(frame: _Frame, lever: jax.Array, moves: jax.Array) -> jax.Array:
@@ -664,7 +742,9 @@ def _coarse(frame: _Frame, structure: Structure) -> Any:
     usable = diagonal > 0
     unit = jnp.where(usable, jax.lax.rsqrt(jnp.where(usable, diagonal, 1)), 0)
     matrix = unit[:, None] * matrix * unit[None, :]
-    factor = _factor(matrix, usable)
+    shift = COARSE_SHIFT * jnp.finfo(matrix.dtype).eps
+    matrix = matrix + jnp.diag(jnp.where(usable, shift, 0).astype(matrix.dtype))
+    inverse = _inverse(matrix[None])[0]
 
     def correct(residual: jax.Array) -> jax.Array:
         force, torque = (
@@ -673,31 +753,15 @@ def _coarse(frame: _Frame, structure: Structure) -> Any:
         )
         total = jnp.concatenate([force, torque], axis=1)
         total = graph.group_sum(total, member, groups).reshape(-1)
-        answer = unit * jax.scipy.linalg.cho_solve((factor, True), unit * total)
+        total = unit * total
+        answer = inverse @ total
+        # Slender structures ask for more digits than an inverse has.
+        answer = unit * (answer + inverse @ (total - matrix @ answer))
         motion = _rows(answer.reshape(groups, 6), member)
         move = motion[:, :3] + jnp.cross(motion[:, 3:], arm)
         return jnp.concatenate([move, motion[:, 3:]], axis=1)
 
     return correct
-
-
-def _factor(matrix: jax.Array, usable: jax.Array) -> jax.Array:
-    """Return the Cholesky factor, shifted as little as makes it one."""
-    eps = jnp.finfo(matrix.dtype).eps
-
-    def shifted(shift: float) -> jax.Array:
-        diagonal = jnp.where(usable, shift * eps, 1).astype(matrix.dtype)
-        return jnp.linalg.cholesky(matrix + jnp.diag(diagonal))
-
-    def failed(factor: jax.Array) -> jax.Array:
-        return ~jnp.isfinite(jnp.sum(jnp.diagonal(factor)))
-
-    factor = shifted(COARSE_SHIFTS[0])
-    for shift in COARSE_SHIFTS[1:]:
-        factor = jax.lax.cond(
-            failed(factor), lambda shift=shift: shifted(shift), lambda f=factor: f
-        )
-    return factor
 
 
 def _rigid(lever: jax.Array) -> jax.Array:

@@ -308,7 +308,7 @@ def update(
         damage=Damage(bond=jnp.where(in_solver, amount, 0)),
         overstressed=jnp.sum(over, dtype=jnp.int32),
         iterations=steps,
-        converged=found.done,
+        converged=found.done & jnp.all(jnp.isfinite(x)),
         error_linear=found.error_linear,
         error_angular=found.error_angular,
     )

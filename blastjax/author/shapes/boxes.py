@@ -11,6 +11,7 @@ import numpy as np
 
 from blastjax.author.asset import build
 from blastjax.author.descriptions import Bonds, Chunks, reals, refuse
+from blastjax.author.overlap import box_pairs
 from blastjax.core import NO_PARENT, WORLD, Asset
 
 SIDES = ("x-", "x+", "y-", "y+", "z-", "z+")
@@ -50,7 +51,7 @@ def boxes(
     unknown = [side for side in anchor if side not in SIDES]
     if unknown:
         raise ValueError(f"anchor {unknown[0]!r} is no side; give any of {SIDES}")
-    pieces = _counts("pieces", pieces, 3)
+    pieces = counts("pieces", pieces, 3)
 
     bonds = [_touching(center, size), *(_anchored(center, size, s) for s in anchor)]
     offset = 1 if root else 0
@@ -91,8 +92,8 @@ def grid(
       brick: extent of one box, m.
       **options: of `boxes`.
     """
-    counts = _counts("shape", shape, 3)
-    return boxes(*_lattice(counts, _extent(brick)), **options)
+    number = counts("shape", shape, 3)
+    return boxes(*_lattice(number, extent_of(brick)), **options)
 
 
 def beam(
@@ -130,8 +131,8 @@ def tower(
       anchor: see `boxes`.
       **options: of `boxes`.
     """
-    levels, side = _counts("levels and side", (levels, side), 2)
-    center, size = _lattice((side, side, levels), _extent(brick))
+    levels, side = counts("levels and side", (levels, side), 2)
+    center, size = _lattice((side, side, levels), extent_of(brick))
     edge = (side - 1) / 2 * np.asarray(brick[:2], float)
     outer = (np.abs(center[:, :2]) > edge - 1e-9 * np.asarray(brick[:2])).any(axis=1)
     return boxes(center[outer], size[outer], anchor=anchor, **options)
@@ -156,8 +157,8 @@ def wall(
       anchor: see `boxes`.
       **options: of `boxes`.
     """
-    bricks, courses = _counts("bricks and courses", (bricks, courses), 2)
-    extent = _extent(brick)
+    bricks, courses = counts("bricks and courses", (bricks, courses), 2)
+    extent = extent_of(brick)
     center, size = [], []
     for course in range(courses):
         cuts = np.arange(bricks + 1.0)
@@ -174,7 +175,8 @@ def wall(
     return boxes(np.concatenate(center), np.concatenate(size), anchor=anchor, **options)
 
 
-def _counts(name: str, values: Sequence[int], number: int) -> tuple[int, ...]:
+def counts(name: str, values: Sequence[int], number: int) -> tuple[int, ...]:
+    """Return whole numbers from 1, or raise ValueError."""
     if len(values) != number:
         raise ValueError(f"{name} has {len(values)} numbers; give {number}")
     for i, value in enumerate(values):
@@ -185,18 +187,17 @@ def _counts(name: str, values: Sequence[int], number: int) -> tuple[int, ...]:
     return tuple(int(value) for value in values)
 
 
-def _extent(brick: Sequence[float]) -> np.ndarray:
+def extent_of(brick: Sequence[float]) -> np.ndarray:
+    """Return the extents of a brick, or raise ValueError."""
     extent = reals("brick", np.asarray(brick), (3,))
     refuse(extent <= 0, extent, "brick[{i}] is {v}; an extent is positive, in m")
     return extent
 
 
-def _lattice(
-    counts: Sequence[int], extent: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    index = np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), axis=-1)
-    center = (index.reshape(-1, 3) - (np.asarray(counts) - 1) / 2) * extent
-    center[:, 2] += counts[2] * extent[2] / 2
+def _lattice(shape: Sequence[int], extent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    index = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1)
+    center = (index.reshape(-1, 3) - (np.asarray(shape) - 1) / 2) * extent
+    center[:, 2] += shape[2] * extent[2] / 2
     return center, np.tile(extent / 2, (len(center), 1))
 
 
@@ -227,28 +228,23 @@ def _pieces(
 def _touching(center: np.ndarray, size: np.ndarray) -> Bonds:
     """Return the bonds of boxes that share part of a face."""
     tolerance = 1e-6 * size.min()
-    pairs, normals, areas, centroids = [], [], [], []
     low, high = center - size, center + size
+    met = box_pairs(low, high, tolerance)
+    pairs, normals, areas, centroids = [], [], [], []
     for axis in range(3):
         others = [i for i in range(3) if i != axis]
-        # Boxes that end and boxes that begin at the same plane, plane by plane.
-        planes = np.round(np.concatenate([high[:, axis], low[:, axis]]) / tolerance)
-        _, group = np.unique(planes, return_inverse=True)
-        ends, begins = group[: len(center)], group[len(center) :]
-        for plane in np.intersect1d(ends, begins):
-            a, b = np.flatnonzero(ends == plane), np.flatnonzero(begins == plane)
-            from_ = np.maximum(low[a][:, None], low[b][None])[:, :, others]
-            to = np.minimum(high[a][:, None], high[b][None])[:, :, others]
-            i, j = np.nonzero((to - from_ > tolerance).all(axis=2))
-            middle = np.zeros((len(i), 3))
-            middle[:, others] = ((from_ + to) / 2)[i, j]
-            middle[:, axis] = high[a[i], axis]
-            pairs.append(np.stack([a[i], b[j]], axis=1))
-            normals.append(np.tile(np.eye(3)[axis], (len(i), 1)))
-            areas.append(np.prod((to - from_)[i, j], axis=1))
+        for a, b in (met.T, met[:, ::-1].T):
+            touch = np.abs(high[a, axis] - low[b, axis]) <= tolerance
+            a, b = a[touch], b[touch]
+            from_, to = np.maximum(low[a], low[b]), np.minimum(high[a], high[b])
+            share = ((to - from_)[:, others] > tolerance).all(axis=1)
+            a, b, from_, to = a[share], b[share], from_[share], to[share]
+            middle = (from_ + to) / 2
+            middle[:, axis] = high[a, axis]
+            pairs.append(np.stack([a, b], axis=1))
+            normals.append(np.tile(np.eye(3)[axis], (len(a), 1)))
+            areas.append(np.prod((to - from_)[:, others], axis=1))
             centroids.append(middle)
-    if not pairs:
-        return Bonds.none()
     return Bonds(*(np.concatenate(x) for x in (pairs, normals, areas, centroids)))
 
 

@@ -1,0 +1,217 @@
+"""Hulls against boxes, rest, and MuJoCo C: python -m tests.benchmarks.hulls.
+
+Three tables. Compilation and step time of a slab of 64 Voronoi pieces as 64 distinct
+hulls and as 64 boxes, in one process, interleaved. How still and how deep pieces of a
+broken slab and vase lie after they fell. How far single pieces end up from where
+MuJoCo C, with mesh geoms, leaves them. float32, unless --x64.
+"""
+
+import argparse
+import json
+import time
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from blastjax import world
+from blastjax.author import cut, hulls
+from blastjax.core import NONE
+from blastjax.rigid import build
+from tests import pieces
+
+FLOOR = """
+<mujoco><option timestep="0.004" impratio="{}"/><worldbody>
+<light pos="0 0 3" directional="true"/>
+<geom name="floor" type="plane" size="0 0 .05"/></worldbody></mujoco>
+"""
+SLAB = np.array([0.5, 0.4, 0.08])
+
+
+def solid(kind, sites):
+    """Return a slab of 1 m or a vase of 0.5 m, cut at the sites."""
+    if kind == "slab":
+        return pieces.voronoi(SLAB, sites, seed=3)
+    tree = cut.voronoi(*_sited(pieces.vase(), sites))
+    return cut.destructible(tree).destructible
+
+
+def _sited(mesh, sites):
+    tree = cut.solid(mesh)
+    return tree, cut.uniform(tree, sites, seed=1)
+
+
+def timed(scene, start, repeats):
+    """Return seconds to trace, to compile, and the compiled step."""
+    began = time.perf_counter()
+    lowered = jax.jit(world.step).lower(scene, start)
+    traced = time.perf_counter()
+    step = lowered.compile()
+    return traced - began, time.perf_counter() - traced, step
+
+
+def compilation(sites=64, slots=8, repeats=30):
+    """Return rows of what 64 hulls and 64 boxes cost."""
+    slab = solid("slab", sites)
+    scenes = {
+        "boxes": build(slab.asset, slots=slots, position=(0, 0, 0.079)),
+        "hulls": build(slab, slots=slots, position=(0, 0, 0.079), collision="hull"),
+    }
+    rows, steps = {}, {}
+    for name, scene in scenes.items():
+        start = world.init(scene)
+        trace, compiled, step = timed(scene, start, repeats)
+        rows[name] = {"trace": trace, "compile": compiled}
+        steps[name] = (step, scene, start)
+    spent = {name: [] for name in scenes}
+    for _ in range(repeats):
+        for name, (step, scene, start) in steps.items():
+            began = time.perf_counter()
+            jax.block_until_ready(step(scene, start))
+            spent[name].append(time.perf_counter() - began)
+    for name in scenes:
+        rows[name]["step_ms"] = 1e3 * float(np.median(spent[name]))
+    return rows
+
+
+def rest(kind, sites, seconds=4.0, impratio=10.0, vertices=32):
+    """Drop a solid, let it break, and measure how its pieces lie in the last 0.2 s."""
+    thing = solid(kind, sites)
+    table = hulls.fit(thing, vertices=vertices)
+    scene = build(
+        thing,
+        slots=len(thing.meshes),
+        collision="hull",
+        hulls=table,
+        position=(0, 0, 0.4 if kind == "slab" else 0.3),
+        model=FLOOR.format(impratio),
+    )
+    impact = world.Impact(hardness=0.3, max_radius=1.0)
+
+    @jax.jit
+    def run(scene, start):
+        def one(state, _):
+            state, events = world.step(scene, state, impact=impact)
+            moved = state.data.qvel[scene.host.slot_dof]
+            used = state.bodies.label != NONE
+            speed = jnp.max(jnp.where(used, jnp.linalg.norm(moved[:, :3], axis=1), 0))
+            deep = -jnp.min(state.data._impl.contact.dist)
+            low = jnp.min(
+                jnp.where(used, state.data.qpos[scene.host.slot_qpos][:, 2], 9)
+            )
+            residual = events.solver.residual
+            return state, jnp.stack([speed, deep, low, jnp.sum(used), residual])
+
+        steps = round(seconds / 0.004)
+        return jax.lax.scan(one, start, length=steps)
+
+    end, track = run(scene, world.init(scene))
+    track = np.asarray(track)
+    last = track[-50:]
+    still = np.flatnonzero(track[:, 0] > 1e-3)
+    return {
+        "actors": int(last[-1, 3]),
+        "speed": float(last[:, 0].max()),
+        "penetration": float(last[:, 1].max()),
+        "lowest_moved": float(np.ptp(last[:, 2])),
+        "still_after": float((still[-1] + 1 if still.size else 0) * 0.004),
+        "broke_at": float(np.flatnonzero(track[:, 3] > 1)[:1].sum() * 0.004),
+        "residual": float(last[:, 4].max()),
+        "dropped": int(end.dropped.contacts + end.dropped.pairs),
+        "fit": [float(f(hulls.fit_error(thing, table))) for f in (np.min, np.max)],
+    }
+
+
+def against_c(count=8, seconds=1.0):
+    """Return how far pieces, dropped one by one, are from C's: height and way, m."""
+    slab, found = solid("slab", 16), []
+    for mesh in slab.meshes[:count]:
+        thing = pieces.destructible([mesh])
+        center = np.asarray(thing.asset.chunk_centroid, float)[0]
+        drop = 0.02 - mesh.vertices[:, 2].min()
+        scene = build(
+            thing,
+            collision="hull",
+            position=(0, 0, drop),
+            model=FLOOR.format(1),
+            tolerance=1e-10,
+            iterations=50,
+        )
+        spec = mujoco.MjSpec.from_string(FLOOR.format(1))
+        spec.option.iterations, spec.option.tolerance = 100, 1e-10
+        spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
+        body = spec.worldbody.add_body(pos=center + np.array([0, 0, drop]))
+        body.add_freejoint()
+        spec.add_mesh(name="m", uservert=(mesh.vertices - center).reshape(-1))
+        body.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_MESH,
+            meshname="m",
+            density=1000.0,
+            contype=0,
+            conaffinity=1,
+            friction=[1.0, 0.005, 0.0001],
+        )
+        model = spec.compile()
+        data = mujoco.MjData(model)
+        steps = round(seconds / 0.004)
+        for _ in range(steps):
+            mujoco.mj_step(model, data)
+        one = jax.jit(lambda s, w: world.step(s, w)[0])
+        state = world.init(scene)
+        for _ in range(steps):
+            state = one(scene, state)
+        ours = np.asarray(state.data.qpos[scene.host.slot_qpos[0, :3]])
+        found.append(np.abs(ours - data.qpos[:3]))
+    return {
+        "height": [float(f[2]) for f in found],
+        "way": [float(np.linalg.norm(f[:2])) for f in found],
+    }
+
+
+def main():
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--sites", type=int, default=64)
+    parser.add_argument("--x64", action="store_true")
+    parser.add_argument("--only", choices=["compile", "rest", "c"])
+    parser.add_argument("--json")
+    options = parser.parse_args()
+    jax.config.update("jax_enable_x64", options.x64)
+    result = {}
+    if options.only in (None, "compile"):
+        result["compile"] = rows = compilation(options.sites)
+        print(f"{options.sites} pieces   trace s  compile s  step ms")
+        for name, row in rows.items():
+            print(
+                f"{name:9} {row['trace']:9.1f} {row['compile']:10.1f} "
+                f"{row['step_ms']:8.2f}"
+            )
+        both = {n: r["trace"] + r["compile"] for n, r in rows.items()}
+        print(
+            f"ratio hulls / boxes, trace + compile: {both['hulls'] / both['boxes']:.2f}"
+        )
+    if options.only in (None, "rest"):
+        result["rest"] = {}
+        for kind, sites in (("slab", 12), ("vase", 12)):
+            for impratio in (1.0, 10.0):
+                found = rest(kind, sites, impratio=impratio)
+                result["rest"][f"{kind} {impratio:g}"] = found
+                print(
+                    f"{kind} impratio {impratio:g}: {found['actors']} pieces, broke at "
+                    f"{found['broke_at']:.2f} s, speed {found['speed']:.1e} m/s in the "
+                    f"last 0.2 s (below 1e-3 from {found['still_after']:.2f} s), "
+                    f"penetration {found['penetration'] * 1e3:.2f} mm, lowest centre "
+                    f"moved {found['lowest_moved']:.1e} m, dropped {found['dropped']}"
+                )
+    if options.only in (None, "c"):
+        result["c"] = found = against_c()
+        for name, rows in found.items():
+            print(f"from C, {name}: " + " ".join(f"{x:.1e}" for x in rows), "m")
+    if options.json:
+        with open(options.json, "w") as file:
+            json.dump(result, file, indent=2)
+
+
+if __name__ == "__main__":
+    main()
