@@ -14,6 +14,7 @@ FLOOR = {
     "pytree": 0,
     "core": 1,
     "spatial": 1,
+    "lanes": 0,
     "graph": 1,
     "author": 2,
     "chunks": 2,

@@ -1,0 +1,98 @@
+"""Islands of many copies of a graph: the same as one by one, whatever the batch is."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.sparse
+from scipy.sparse import csgraph
+
+from blastjax import graph
+
+pytestmark = pytest.mark.usefixtures("strict")
+
+
+def scipys(edges, alive, n):
+    """Label by scipy, one row a copy: copies are blocks of one matrix."""
+    size = len(alive)
+    copy, edge = np.nonzero(alive)
+    ends = edges[edge] + (copy * n)[:, None]
+    matrix = scipy.sparse.coo_matrix((np.ones(len(ends)), ends.T), (size * n,) * 2)
+    _, group = csgraph.connected_components(matrix, directed=False)
+    smallest = np.full(group.max() + 1, size * n)
+    np.minimum.at(smallest, group, np.arange(size * n))
+    return smallest[group].reshape(size, n) - (np.arange(size) * n)[:, None]
+
+
+def random_graph(kind, n, rng):
+    if kind == "chain":  # The longest way, in the worst order.
+        x = rng.permutation(n)
+        return np.stack([x[:-1], x[1:]], 1).astype(np.int32)
+    if kind == "hub":
+        star = np.stack([np.full(n - 1, n // 2), rng.permutation(n - 1)], 1)
+        return np.concatenate([star, rng.integers(0, n, (n, 2))]).astype(np.int32)
+    return rng.integers(0, n, (3 * n // 2, 2)).astype(np.int32)
+
+
+@functools.cache
+def batched(n, placed):
+    def run(edges, alive, place):
+        place = place if placed else None
+        return jax.vmap(lambda x: graph.islands(edges, x, n, place=place))(alive)
+
+    return jax.jit(run)
+
+
+@pytest.mark.parametrize("placed", [False, True])
+@pytest.mark.parametrize(("kind", "n"), [("any", 60), ("hub", 61), ("chain", 300)])
+def test_a_batch_is_scipys(kind, n, placed):
+    rng = np.random.default_rng(n)
+    for _ in range(10):
+        edges = random_graph(kind, n, rng)
+        alive = rng.random((150, len(edges))) < rng.random((150, 1)) ** 0.3
+        place = jnp.asarray(rng.random(n), jnp.float32)
+        found = batched(n, placed)(jnp.asarray(edges), jnp.asarray(alive), place)
+        np.testing.assert_array_equal(found, scipys(edges, alive, n))
+
+
+def two_walls():
+    rng = np.random.default_rng(3)
+    edges = rng.integers(0, 40, (2, 60, 2)).astype(np.int32)
+    alive = rng.random((2, 16, 60)) < 0.5
+    expected = np.stack([scipys(e, a, 40) for e, a in zip(edges, alive, strict=True)])
+    return jnp.asarray(edges), jnp.asarray(alive), expected
+
+
+def test_batches_of_batches():
+    edges, alive, expected = two_walls()
+
+    def islands(e, a):
+        return graph.islands(e, a, 40)
+
+    states = jax.vmap(islands, (None, 0))
+    both = jax.jit(jax.vmap(states))(edges, alive)
+    np.testing.assert_array_equal(both, expected)
+    # The assets on the inner axis, the states on the outer one.
+    outer = jax.jit(jax.vmap(jax.vmap(islands), (None, 1), 1))(edges, alive)
+    np.testing.assert_array_equal(outer, expected)
+    shared = jax.jit(jax.vmap(states, (None, 0)))(edges[0], alive)
+    np.testing.assert_array_equal(shared[0], expected[0])
+    looped = jax.lax.scan(lambda c, a: (c, states(edges[0], a)), 0, alive)[1]
+    np.testing.assert_array_equal(looped, shared)
+
+
+def test_derivatives_pass_around():
+    edges, _, _ = two_walls()
+    strength = jnp.linspace(-1, 1, 16 * 60).reshape(16, 60).astype(jnp.float32)
+
+    def total(x):
+        label = graph.islands(edges[0], x > 0, 40)
+        return jnp.sum(x) * jnp.sum(label).astype(x.dtype)
+
+    of_sum = jax.jit(jax.grad(lambda x: jax.vmap(total)(x).sum()))(strength)
+    one_by_one = jax.jit(jax.vmap(jax.grad(total)))(strength)
+    forward = jax.jit(jax.vmap(jax.jacfwd(total)))(strength)
+    np.testing.assert_allclose(of_sum, one_by_one)
+    np.testing.assert_allclose(of_sum, forward)
