@@ -203,6 +203,9 @@ def draw(tables, path):
     for name in dict.fromkeys(n for t in tables for n in t["microseconds"]):
         line = [(t[key], t["microseconds"].get(name, np.nan)) for t in tables]
         axes.loglog(*zip(*line, strict=True), "o-", label=name)
+    ticks = sorted({t[key] for t in tables})
+    axes.set_xticks(ticks, [str(tick) for tick in ticks])
+    axes.minorticks_off()
     axes.set_xlabel(key)
     axes.set_ylabel("microseconds a step of a world")
     axes.legend()
