@@ -41,14 +41,16 @@ def islands(
     """
     if edges.shape[0] == 0:
         return jnp.arange(num_nodes, dtype=jnp.int32)
-    if num_nodes >= lanes.LIMIT:
-        return _hook_and_jump(edges, alive, num_nodes)
     if place is None:
         place = jnp.arange(num_nodes, dtype=jnp.int32)
-    return _one(num_nodes)(edges, alive, jax.lax.stop_gradient(place))
+    if num_nodes >= lanes.LIMIT:
+        return _hook_and_jump(edges, place, alive)
+    search = _one(_hook_and_jump, lanes.in_tiles)
+    return search(edges, jax.lax.stop_gradient(place), alive)
 
 
-def _hook_and_jump(edges: jax.Array, alive: jax.Array, num_nodes: int) -> jax.Array:
+def _hook_and_jump(edges: jax.Array, place: jax.Array, alive: jax.Array) -> jax.Array:
+    num_nodes = place.shape[0]
     first, second = edges[:, 0], edges[:, 1]
     nodes = jnp.arange(num_nodes, dtype=jnp.int32)
 
@@ -65,92 +67,78 @@ def _hook_and_jump(edges: jax.Array, alive: jax.Array, num_nodes: int) -> jax.Ar
     return jax.lax.while_loop(lambda carry: carry[1], hook, start)[0]
 
 
-Kernel = Callable[[jax.Array, jax.Array, jax.Array], jax.Array]
+Kernel = Callable[..., jax.Array]
+"""A search: of edges (B, 2), place (N,), and arrays of what it is to know of them."""
 
 
 @functools.cache
-def _one(num_nodes: int) -> Kernel:
-    """Return the islands of one graph, which know what a batch of them should do."""
+def _one(rounds: Kernel, sweeps: Kernel) -> Kernel:
+    """Return the search of one graph, which knows what a batch of it should do.
+
+    Args:
+      rounds: searches one graph.
+      sweeps: searches many copies of one graph; all but edges and place is (T, ...).
+    """
 
     @jax.custom_batching.custom_vmap
-    def one(edges: jax.Array, alive: jax.Array, place: jax.Array) -> jax.Array:
-        del place
-        return _hook_and_jump(edges, alive, num_nodes)
+    def one(edges: jax.Array, place: jax.Array, *known: jax.Array) -> jax.Array:
+        return rounds(edges, place, *known)
 
     @one.def_vmap
     def batched(
-        size: int,
-        is_batched: Sequence[bool],
-        edges: jax.Array,
-        alive: jax.Array,
-        place: jax.Array,
+        size: int, is_batched: Sequence[bool], *args: jax.Array
     ) -> tuple[jax.Array, bool]:
+        edges, place, *known = _full(size, is_batched, args)
         if is_batched[0]:
-            return _each(one, size, is_batched, edges, alive, place), True
-        if not is_batched[1]:
-            alive = jnp.broadcast_to(alive, (size, *alive.shape))
-        if is_batched[2]:
-            place = place[0]  # It changes no result.
-        return _many(num_nodes)(edges, alive, place), True
+            return jax.vmap(rounds)(edges, place, *known), True
+        # The place changes no result: that of the first copy is as good as any.
+        return _many(rounds, sweeps)(edges[0], place[0], *known), True
 
     return one
 
 
 @functools.cache
-def _many(num_nodes: int) -> Kernel:
-    """Return the islands of many copies (T, B) of one graph."""
+def _many(rounds: Kernel, sweeps: Kernel) -> Kernel:
+    """Return the search of many copies of one graph."""
 
     @jax.custom_batching.custom_vmap
-    def many(edges: jax.Array, alive: jax.Array, place: jax.Array) -> jax.Array:
-        def rounds(edges: jax.Array, alive: jax.Array, place: jax.Array) -> jax.Array:
-            del place
-            return jax.vmap(lambda x: _hook_and_jump(edges, x, num_nodes))(alive)
-
-        def sweeps(edges: jax.Array, alive: jax.Array, place: jax.Array) -> jax.Array:
-            return lanes.in_tiles(edges, alive, place)
+    def many(edges: jax.Array, place: jax.Array, *known: jax.Array) -> jax.Array:
+        def each(edges: jax.Array, place: jax.Array, *known: jax.Array) -> jax.Array:
+            return jax.vmap(lambda *x: rounds(edges, place, *x))(*known)
 
         # A sweep is one long chain of small steps, the wrong thing for an accelerator,
         # and for a handful of copies.
-        if alive.shape[0] < FEW:
-            return rounds(edges, alive, place)
+        if known[0].shape[0] < FEW:
+            return each(edges, place, *known)
         return jax.lax.platform_dependent(
-            edges, alive, place, cpu=sweeps, default=rounds
+            edges, place, *known, cpu=sweeps, default=each
         )
 
     @many.def_vmap
     def batched(
-        size: int,
-        is_batched: Sequence[bool],
-        edges: jax.Array,
-        alive: jax.Array,
-        place: jax.Array,
+        size: int, is_batched: Sequence[bool], *args: jax.Array
     ) -> tuple[jax.Array, bool]:
+        edges, place, *known = _full(size, is_batched, args)
         if is_batched[0]:
-            return _each(many, size, is_batched, edges, alive, place), True
-        if not is_batched[1]:
-            alive = jnp.broadcast_to(alive, (size, *alive.shape))
-        if is_batched[2]:
-            place = place[0]
-        copies = alive.reshape(-1, alive.shape[-1])
-        label = many(edges, copies, place)
-        return label.reshape(*alive.shape[:2], num_nodes), True
+            # Different graphs: together if each has one copy, else one by one.
+            if known[0].shape[1] == 1:
+                only = jax.vmap(rounds)(edges, place, *[x[:, 0] for x in known])
+                return only[:, None], True
+            return jax.lax.map(lambda x: many(*x), (edges, place, *known)), True
+        copies = [x.reshape(-1, *x.shape[2:]) for x in known]
+        found = many(edges[0], place[0], *copies)
+        return found.reshape(*known[0].shape[:2], -1), True
 
     return many
 
 
-def _each(
-    kernel: Kernel, size: int, is_batched: Sequence[bool], *args: jax.Array
-) -> jax.Array:
-    """Solve different graphs: together if each has one copy, else one by one."""
-    full = [
+def _full(
+    size: int, is_batched: Sequence[bool], args: Sequence[jax.Array]
+) -> list[jax.Array]:
+    return [
         x if b else jnp.broadcast_to(x, (size, *x.shape))
         for x, b in zip(args, is_batched, strict=True)
     ]
-    edges, alive, place = full
-    num_nodes = place.shape[-1]
-    if alive.ndim == 2:
-        return jax.vmap(lambda e, a: _hook_and_jump(e, a, num_nodes))(edges, alive)
-    return jax.lax.map(lambda x: kernel(*x), (edges, alive, place))
 
 
 def shortest_ways(
@@ -192,7 +180,12 @@ def shortest_ways(
 
 
 def bottleneck(
-    edges: jax.Array, weight: jax.Array, source: jax.Array, num_nodes: int
+    edges: jax.Array,
+    weight: jax.Array,
+    source: jax.Array,
+    num_nodes: int,
+    *,
+    place: jax.Array | None = None,
 ) -> tuple[jax.Array, jax.Array]:
     """Find the way to a source whose weakest edge is as strong as possible.
 
@@ -201,6 +194,7 @@ def bottleneck(
       weight: (B,) strength, any sign; minus infinity or NaN if an edge leads nowhere.
       source: (N,) bool, the nodes to reach.
       num_nodes: N.
+      place: (N,) see `islands`.
 
     Returns:
       (N,) weight of the weakest edge on the best way: infinite at the sources, minus
@@ -209,31 +203,65 @@ def bottleneck(
       is above t. The derivative is one for the weakest edge and zero for all others,
       exact wherever no two weights tie; of equal edges one is chosen.
 
-    Boruvka's rounds: every tree without a source hooks onto the tree behind the
-    strongest edge that leaves it. No edge inside a tree is weaker than the one by which
-    it hooks, so the minimum along the hooks is the answer, found by pointer doubling.
+    One graph is solved by Boruvka's rounds. A `vmap` over weights and sources, on the
+    CPU, sweeps over all copies side by side instead (see `lanes`).
     """
     num_edges = edges.shape[0]
     lowest = jnp.array(-jnp.inf, weight.dtype)
-    nodes = jnp.arange(num_nodes, dtype=jnp.int32)
     if num_edges == 0:
-        return jnp.where(source, jnp.inf, lowest), jnp.full_like(nodes, -1)
-    first, second = edges[:, 0], edges[:, 1]
-    index = jnp.arange(num_edges, dtype=jnp.int32)
-    # Loops run on constants: nothing in here is differentiated.
+        none = jnp.full(num_nodes, -1, jnp.int32)
+        return jnp.where(source, jnp.inf, lowest), none
+    # Searches run on constants: nothing in there is differentiated.
     strength = jax.lax.stop_gradient(weight)
     strength = jnp.where(strength > lowest, strength, lowest)
+    if place is None:
+        place = jnp.arange(num_nodes, dtype=jnp.int32)
+    search = _one(_boruvka, lanes.bottlenecks_in_tiles)
+    cost = lanes.to_rank(-strength)
+    edge = search(edges, jax.lax.stop_gradient(place), cost, source)
+    # Sources and what infinite weights lead to have one past the last edge.
+    found = (edge >= 0) & (edge < num_edges)
+    pick = jnp.where(found, edge, 0)
+    finite = found & jnp.isfinite(strength[pick])
+    bound = jnp.where(found, strength[pick], jnp.where(edge < 0, -jnp.inf, jnp.inf))
+    least = jnp.where(finite, weight[pick], bound.astype(weight.dtype))
+    return least, jnp.where(finite, edge, -1)
+
+
+def _boruvka(
+    edges: jax.Array, place: jax.Array, cost: jax.Array, source: jax.Array
+) -> jax.Array:
+    """Return which edge is the dearest on the cheapest way to a source, (N,) int32.
+
+    Every tree without a source hooks onto the tree behind the cheapest edge that leaves
+    it. No edge inside a tree is dearer than the one by which it hooks, so the maximum
+    along the hooks is the answer, found by pointer doubling.
+
+    Args:
+      edges: (B, 2) nodes.
+      place: (N,) not looked at.
+      cost: (B,) integers.
+      source: (N,) bool.
+
+    Returns:
+      The edge; B at the sources, -1 where no way leads.
+    """
+    num_nodes, num_edges = place.shape[0], edges.shape[0]
+    nodes = jnp.arange(num_nodes, dtype=jnp.int32)
+    first, second = edges[:, 0], edges[:, 1]
+    index = jnp.arange(num_edges, dtype=jnp.int32)
+    top = jnp.array(jnp.iinfo(cost.dtype).max, cost.dtype)
 
     def hook(
         carry: tuple[jax.Array, jax.Array, jax.Array, jax.Array],
     ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
         root, up, edge, _ = carry
         a, b = root[first], root[second]
-        out = jnp.where(a != b, strength, lowest)
-        best = jnp.full(num_nodes, lowest).at[a].max(out).at[b].max(out)
+        out = jnp.where(a != b, cost, top)
+        best = jnp.full(num_nodes, top).at[a].min(out).at[b].min(out)
         # Of equal edges the first: without one order for all, hooks could form rings.
-        at_a = jnp.where((out > lowest) & (out == best[a]), index, num_edges)
-        at_b = jnp.where((out > lowest) & (out == best[b]), index, num_edges)
+        at_a = jnp.where((out < top) & (out == best[a]), index, num_edges)
+        at_b = jnp.where((out < top) & (out == best[b]), index, num_edges)
         pick = jnp.full(num_nodes, num_edges, jnp.int32).at[a].min(at_a).at[b].min(at_b)
         chosen = jnp.minimum(pick, num_edges - 1)
         to = jnp.where(a[chosen] == nodes, b[chosen], a[chosen])
@@ -250,18 +278,18 @@ def bottleneck(
     def double(
         carry: tuple[jax.Array, jax.Array, jax.Array, jax.Array],
     ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-        up, least, edge, _ = carry
-        weaker = least[up] < least
-        least = jnp.where(weaker, least[up], least)
-        edge = jnp.where(weaker, edge[up], edge)
-        return up[up], least, edge, jnp.any(up[up] != up)
+        up, dearest, edge, _ = carry
+        dearer = dearest[up] > dearest
+        dearest = jnp.where(dearer, dearest[up], dearest)
+        edge = jnp.where(dearer, edge[up], edge)
+        return up[up], dearest, edge, jnp.any(up[up] != up)
 
-    least = jnp.where(edge < 0, lowest, strength[edge])
-    least = jnp.where(source, jnp.inf, least)
-    carry = up, least, edge, jnp.array(True)
-    _, least, edge, _ = jax.lax.while_loop(lambda c: c[3], double, carry)
-    finite = jnp.isfinite(least)
-    return jnp.where(finite, weight[edge], least), jnp.where(finite, edge, -1)
+    # Trees that reach no source end at a root of their own.
+    dearest = jnp.where(edge < 0, top, cost[edge])
+    dearest = jnp.where(source, jnp.iinfo(cost.dtype).min, dearest)
+    edge = jnp.where(source, num_edges, edge)
+    carry = up, dearest, edge, jnp.array(True)
+    return jax.lax.while_loop(lambda c: c[3], double, carry)[2]
 
 
 def _ends(pointer: jax.Array) -> jax.Array:

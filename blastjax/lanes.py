@@ -1,4 +1,4 @@
-"""Many copies of one graph side by side: islands by sweeps over lanes.
+"""Many copies of one graph side by side: islands and best ways by sweeps over lanes.
 
 Labels are rows of nodes by columns of copies, so that the neighbour that a node reads
 is one contiguous row for all of them: no scatter, and no gather that differs from copy
@@ -112,13 +112,19 @@ def islands(way: Order, dead: jax.Array) -> jax.Array:
     rows = -(-num_nodes // ROWS) * ROWS
     labels = lax.broadcasted_iota(dead.dtype, (rows, lanes), 0)
 
+    def offer(
+        labels: jax.Array, here: jax.Array, node: jax.Array, edge: jax.Array
+    ) -> jax.Array:
+        del here
+        return _row(labels, node) | _row(dead, edge)
+
     def half(
         carry: tuple[jax.Array, jax.Array, jax.Array, jax.Array],
     ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
         labels, total, count, _ = carry
         jumps = (count >= 2 * PATIENCE) & (count % 2 == 0)
         labels = lax.cond(jumps, _jump, lambda x: x, labels)
-        labels = _sweep(labels, dead, way, count % 2)
+        labels = _sweep(labels, way, count % 2, offer)
         now = _total(labels)
         # A sweep without a change is the end, for the one before went the other way.
         return labels, now, count + 1, (count == 0) | jnp.any(now != total)
@@ -128,40 +134,44 @@ def islands(way: Order, dead: jax.Array) -> jax.Array:
 
 
 def _sweep(
-    labels: jax.Array, dead: jax.Array, way: Order, side: jax.Array
+    rows: jax.Array,
+    way: Order,
+    side: jax.Array,
+    offer: Callable[[jax.Array, jax.Array, jax.Array, jax.Array], jax.Array],
 ) -> jax.Array:
-    def offer(labels: jax.Array, node: jax.Array, edge: jax.Array) -> jax.Array:
-        return _row(labels, node) | _row(dead, edge)
+    """Lower each node's row to the least of offer(rows, node, neighbour, edge)."""
 
     def of_degree(degree: int) -> Callable[[jax.Array, jax.Array], jax.Array]:
-        def relax(labels: jax.Array, i: jax.Array) -> jax.Array:
-            low = _row(labels, way.visit[side, i])
+        def relax(rows: jax.Array, i: jax.Array) -> jax.Array:
+            here = way.visit[side, i]
+            low = _row(rows, here)
             for j in range(degree):
                 node, edge = way.near[side, i, j], way.by[side, i, j]
-                low = jnp.minimum(low, offer(labels, node, edge))
+                low = jnp.minimum(low, offer(rows, here, node, edge))
             return low
 
         return relax
 
-    def hub(labels: jax.Array, i: jax.Array) -> jax.Array:
+    def hub(rows: jax.Array, i: jax.Array) -> jax.Array:
+        here = way.visit[side, i]
+
         def one(j: jax.Array, low: jax.Array) -> jax.Array:
             j = way.start[side, i] + j
             node, edge = way.node[side, j], way.edge[side, j]
-            return jnp.minimum(low, offer(labels, node, edge))
+            return jnp.minimum(low, offer(rows, here, node, edge))
 
-        low = _row(labels, way.visit[side, i])
-        return lax.fori_loop(0, way.degree[side, i], one, low)
+        return lax.fori_loop(0, way.degree[side, i], one, _row(rows, here))
 
     branches = [*map(of_degree, DEGREES), hub]
 
-    def turn(i: jax.Array, labels: jax.Array) -> jax.Array:
-        low = lax.switch(way.kind[side, i], branches, labels, i)
+    def turn(i: jax.Array, rows: jax.Array) -> jax.Array:
+        low = lax.switch(way.kind[side, i], branches, rows, i)
         # Without the barrier XLA computes the row anew wherever it is read.
         low = lax.optimization_barrier(low)
         here = way.visit[side, i], jnp.int32(0)
-        return lax.dynamic_update_slice(labels, low, here)
+        return lax.dynamic_update_slice(rows, low, here)
 
-    return lax.fori_loop(0, way.visit.shape[1], turn, labels)
+    return lax.fori_loop(0, way.visit.shape[1], turn, rows)
 
 
 def _row(x: jax.Array, i: jax.Array) -> jax.Array:
@@ -215,17 +225,131 @@ def from_labels(labels: jax.Array) -> jax.Array:
     return flat.reshape(lanes, -1)[:, :num_nodes].astype(jnp.int32)
 
 
-def in_tiles(edges: jax.Array, alive: jax.Array, place: jax.Array) -> jax.Array:
+def bottlenecks(
+    way: Order, edges: jax.Array, cost: jax.Array, source: jax.Array
+) -> jax.Array:
+    """Find the ways to sources, in every copy, whose dearest edge is cheapest.
+
+    First the levels, what the dearest edges cost; then which edges these are.
+
+    Args:
+      way: the way through the graph, of N nodes and B edges.
+      edges: (B, 2) nodes.
+      cost: (B + 1, T) signed integers; the last is the greatest there is, no other is
+        that or the least.
+      source: (N, T) bool.
+
+    Returns:
+      (N, T) unsigned, the dearest edge of a best way; of equal edges one on a way that
+      visits no node twice. B at sources, all ones where no way leads.
+    """
+    limits = jnp.iinfo(cost.dtype)
+
+    def dearest(
+        level: jax.Array, here: jax.Array, node: jax.Array, edge: jax.Array
+    ) -> jax.Array:
+        del here
+        return jnp.maximum(_row(level, node), _row(cost, edge))
+
+    start = jnp.where(source, limits.min, limits.max).astype(cost.dtype)
+    level = _settle(start, way, dearest)
+    dtype = np.uint16 if cost.shape[0] < LIMIT else np.uint32
+    none = dtype(np.iinfo(dtype).max)
+
+    def leave(
+        name: jax.Array, here: jax.Array, node: jax.Array, edge: jax.Array
+    ) -> jax.Array:
+        # The dear edge is the one by which the way leaves the nodes of its level.
+        del name
+        near, far = _row(level, here), _row(level, node)
+        leaves = jnp.maximum(far, _row(cost, edge)) == near
+        return jnp.where(leaves & (far < near), edge.astype(dtype), none)
+
+    # All nodes that it can be reached from on their level share its name.
+    a, b = level[edges[:, 0]], level[edges[:, 1]]
+    apart = jnp.where((a == b) & (cost[:-1] <= a), dtype(0), none)
+    apart = jnp.concatenate([apart, jnp.full((1, cost.shape[1]), none)])
+
+    def share(
+        name: jax.Array, here: jax.Array, node: jax.Array, edge: jax.Array
+    ) -> jax.Array:
+        del here
+        return _row(name, node) | _row(apart, edge)
+
+    name = jnp.where(source, dtype(edges.shape[0]), none)
+    for side in (0, 1):
+        name = _sweep(name, way, jnp.int32(side), leave)
+    return _settle(name, way, share)
+
+
+def _settle(
+    rows: jax.Array,
+    way: Order,
+    offer: Callable[[jax.Array, jax.Array, jax.Array, jax.Array], jax.Array],
+) -> jax.Array:
+    """Sweep to and fro until nothing changes."""
+
+    def half(
+        carry: tuple[jax.Array, jax.Array, jax.Array],
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        rows, count, _ = carry
+        new = _sweep(rows, way, count % 2, offer)
+        return new, count + 1, (count == 0) | jnp.any(new != rows)
+
+    start = rows, jnp.int32(0), jnp.array(True)
+    return lax.while_loop(lambda c: c[2], half, start)[0]
+
+
+def in_tiles(edges: jax.Array, place: jax.Array, alive: jax.Array) -> jax.Array:
     """Label the nodes of copies (T, B) of one graph: (T, N) int32."""
-    size, num_nodes = alive.shape[0], place.shape[0]
+    num_nodes = place.shape[0]
     dtype, way = label_dtype(num_nodes), order(edges, num_nodes, place)
+    return _tiled(lambda x: from_labels(islands(way, to_dead(x, dtype))), alive)
+
+
+def bottlenecks_in_tiles(
+    edges: jax.Array, place: jax.Array, cost: jax.Array, source: jax.Array
+) -> jax.Array:
+    """Find dearest edges in copies of one graph.
+
+    Args:
+      edges: (B, 2) nodes.
+      place: (N,) see `order`.
+      cost: (T, B) of `to_rank`.
+      source: (T, N) bool.
+
+    Returns:
+      (T, N) int32 edges; B at sources, -1 where no way leads.
+    """
+    num_edges, num_nodes = edges.shape[0], place.shape[0]
+    way = order(edges, num_nodes, place)
+
+    def tile(cost: jax.Array, source: jax.Array) -> jax.Array:
+        none = jnp.full((1, cost.shape[0]), jnp.iinfo(cost.dtype).max, cost.dtype)
+        cost = jnp.concatenate([lax.optimization_barrier(cost.T), none])
+        edge = from_labels(bottlenecks(way, edges, cost, source.T))
+        return jnp.where(edge > num_edges, -1, edge)
+
+    return _tiled(tile, cost, source)
+
+
+def _tiled(tile: Callable[..., jax.Array], *copies: jax.Array) -> jax.Array:
+    """Call tile on so many copies (T, ...) at a time, and join what it returns."""
+    size = copies[0].shape[0]
     width = min(LANES, -(-size // 32) * 32)
     tiles = -(-size // width)
-    alive = jnp.pad(alive, ((0, tiles * width - size), (0, 0)))
 
-    def tile(alive: jax.Array) -> jax.Array:
-        return from_labels(islands(way, to_dead(alive, dtype)))
+    def split(x: jax.Array) -> jax.Array:
+        x = jnp.pad(x, ((0, tiles * width - size), (0, 0)))
+        return x.reshape(tiles, width, -1)
 
     # Not a vmap: every tile stops when it is done.
-    label = lax.map(tile, alive.reshape(tiles, width, -1))
-    return label.reshape(tiles * width, num_nodes)[:size]
+    found = lax.map(lambda x: tile(*x), tuple(map(split, copies)))
+    return found.reshape(tiles * width, -1)[:size]
+
+
+def to_rank(x: jax.Array) -> jax.Array:
+    """Turn floats into integers of the same order and size; not for NaN."""
+    bits = 8 * x.dtype.itemsize
+    integer = lax.bitcast_convert_type(x, jnp.dtype(f"int{bits}"))
+    return jnp.where(integer < 0, integer ^ jnp.iinfo(integer.dtype).max, integer)

@@ -96,3 +96,52 @@ def test_derivatives_pass_around():
     forward = jax.jit(jax.vmap(jax.jacfwd(total)))(strength)
     np.testing.assert_allclose(of_sum, one_by_one)
     np.testing.assert_allclose(of_sum, forward)
+
+
+@pytest.mark.parametrize("odd", ["none", "ties", "infinite"])
+def test_bottlenecks_of_a_batch_are_those_one_by_one(odd):
+    n, size = 40, 40
+    rng = np.random.default_rng(4)
+    edges = random_graph("hub", n, rng)
+    weight = rng.normal(0.2, 1.0, (size, len(edges))).astype(np.float32)
+    if odd == "ties":
+        weight = np.round(weight)
+    if odd == "infinite":
+        kind = rng.integers(0, 8, weight.shape)
+        for i, x in enumerate((-np.inf, np.inf, np.nan)):
+            weight[kind == i] = x
+    source = rng.random((size, n)) < 0.06
+    source[0] = False
+    edges, weight, source = map(jnp.asarray, (edges, weight, source))
+
+    def search(w, s):
+        return graph.bottleneck(edges, w, s, n)
+
+    def total(w, s):
+        least, edge = search(w, s)
+        return jnp.where(edge >= 0, jnp.arange(1.0, n + 1) * least, 0).sum()
+
+    value, edge = jax.jit(jax.vmap(search))(weight, source)
+    alone, other = jax.jit(lambda *x: jax.lax.map(lambda y: search(*y), x))(
+        weight, source
+    )
+    np.testing.assert_array_equal(value, alone)
+    np.testing.assert_array_equal(edge >= 0, jnp.isfinite(value))
+    taken = jnp.take_along_axis(weight, jnp.maximum(edge, 0), axis=1)
+    np.testing.assert_array_equal(taken[edge >= 0], value[edge >= 0])
+    if odd != "ties":
+        np.testing.assert_array_equal(edge, other)
+    slope = jax.jit(jax.grad(lambda w: jax.vmap(total)(w, source).sum()))(weight)
+    nested = jax.jit(jax.vmap(jax.grad(total)))(weight, source)
+    np.testing.assert_allclose(slope, nested)
+    if odd != "ties":
+        loop = jax.lax.map(lambda x: jax.grad(total)(*x), (weight, source))
+        np.testing.assert_allclose(slope, loop, rtol=1e-6)
+
+
+def test_bottlenecks_without_edges():
+    source = jnp.eye(9, 3, dtype=bool)
+    none, weight = jnp.zeros((0, 2), jnp.int32), jnp.zeros((9, 0), jnp.float32)
+    value, edge = jax.vmap(lambda w, s: graph.bottleneck(none, w, s, 3))(weight, source)
+    np.testing.assert_array_equal(value, np.where(source, np.inf, -np.inf))
+    assert (edge == -1).all()

@@ -110,6 +110,33 @@ def critical(edges, num_nodes, batch, rng):
     return rng.random((batch, len(edges))) < 1.4 / (degree - 1)
 
 
+def margins(name, edges, num_nodes, batch, repeats):
+    """Print what best ways to a source cost, in searches for islands."""
+    rng = np.random.default_rng(2)
+    weight = jnp.asarray(rng.normal(0.2, 1, (batch, len(edges))), jnp.float32)
+    alive, edges, source = weight > 0, jnp.asarray(edges), jnp.arange(num_nodes) == 0
+
+    @jax.jit
+    def islands(e, a):
+        return jax.vmap(lambda x: graph.islands(e, x, num_nodes))(a)
+
+    @jax.jit
+    def bottleneck(e, w):
+        return jax.vmap(lambda x: graph.bottleneck(e, x, source, num_nodes))(w)
+
+    calls = {
+        "islands": lambda: jax.block_until_ready(islands(edges, alive)),
+        "bottleneck": lambda: jax.block_until_ready(bottleneck(edges, weight)),
+    }
+    for call in calls.values():
+        call()
+    a, b = (1e6 * x / batch for x in least(calls, repeats).values())
+    print(
+        f"{name:22s} {batch:5d} islands {a:8.2f} bottleneck {b:8.2f} {b / a:5.1f}x",
+        flush=True,
+    )
+
+
 def scipys(edges, alive, num_nodes):
     for row in alive:
         kept = edges[row]
@@ -214,6 +241,12 @@ def main():
         ):
             rows.append(measure(label, place, edges, alive, cpp, chosen.repeats))
             report(rows[-1])
+    for name, edges, num_nodes in (
+        ("wall 16 x 16", grid((16, 1, 16))[1], 256),
+        ("voronoi 512", voronoi(512)[1], 512),
+    ):
+        for batch in (256, 1024):
+            margins(name, edges, num_nodes, batch, chosen.repeats)
     if chosen.json:
         chosen.json.write_text(json.dumps(rows, indent=1))
     if chosen.picture:
