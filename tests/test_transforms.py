@@ -263,41 +263,32 @@ def padded(sample):
     return asset, worn_once(asset)
 
 
-def heavy_slow(*heavy):
-    """Return the table's names; of the heavy ones this check is for `-m slow`."""
+HEAVY = {
+    *("chance.expect", "chance.expect_by_flips", "crossing.evolve"),
+    *("margins.perturbed_margin", "margins.hold_loss", "margins.release_loss"),
+}
+"""Dear to compile and made of others of the table; their gradients and padding are
+always checked, the rest by `-m slow`."""
+LOOPS = HEAVY | {
+    *("fracture.apply_buffer", "fracture.split", "fracture.step"),
+    *("graph.bottleneck", "graph.shortest_ways", "margins.margin"),
+}
+"""Without jit these compile piece by piece, which takes longer than with it."""
+
+
+def names(slow):
     return [
-        pytest.param(name, marks=pytest.mark.slow) if name in heavy else name
+        pytest.param(name, marks=pytest.mark.slow) if name in slow else name
         for name in TABLE
     ]
 
 
-def same(ours, theirs):
-    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, **CLOSE), ours, theirs)
-
-
-ONE = jnp.float32(1.0)
-
-
-def test_sample_has_actors_of_every_kind(sample):
-    asset, state = sample
-    nodes = asset.span_node.shape[0]
-    active = np.asarray(chunks.active(asset, state))
-    alone = np.asarray(chunks.alone(asset, state))
-    assert active[0]
-    assert not alone[0]
-    assert alone[:nodes].any()
-    assert active[nodes:].any()
-
-
-# Without jit these compile piece by piece, which takes longer than all others do.
-@pytest.mark.parametrize(
-    "name", heavy_slow("chance.expect", "chance.expect_by_flips", "crossing.evolve")
-)
+@pytest.mark.parametrize("name", names(LOOPS))
 def test_jit_is_eager(name, sample):
     same(compiled(name)(*sample, ONE), TABLE[name](*sample, ONE))
 
 
-@pytest.mark.parametrize("name", TABLE)
+@pytest.mark.parametrize("name", names(HEAVY))
 def test_vmap_is_a_loop(name, sample):
     """Over different assets and states."""
     check_vmap(name, sample, 0)
