@@ -283,6 +283,24 @@ def names(slow):
     ]
 
 
+def same(ours, theirs):
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, **CLOSE), ours, theirs)
+
+
+ONE = jnp.float32(1.0)
+
+
+def test_sample_has_actors_of_every_kind(sample):
+    asset, state = sample
+    nodes = asset.span_node.shape[0]
+    active = np.asarray(chunks.active(asset, state))
+    alone = np.asarray(chunks.alone(asset, state))
+    assert active[0]
+    assert not alone[0]
+    assert alone[:nodes].any()
+    assert active[nodes:].any()
+
+
 @pytest.mark.parametrize("name", names(LOOPS))
 def test_jit_is_eager(name, sample):
     same(compiled(name)(*sample, ONE), TABLE[name](*sample, ONE))
