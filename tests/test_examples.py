@@ -65,13 +65,6 @@ def test_how_strong(capsys, tmp_path):
     assert picture.stat().st_size > 5000
 
 
-@pytest.mark.slow
-def test_soft_landing(capsys, tmp_path):
-    before, after, pieces = load("soft_landing").main(tmp_path / "landing.png")
-    assert before > 1 > after and pieces == 1
-    assert "first throw" in capsys.readouterr().out
-
-
 def test_size_a_beam(capsys):
     after = load("size_a_beam").main(length=4, steps=40)
     np.testing.assert_allclose(after, 2.0, rtol=0.01)

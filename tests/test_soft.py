@@ -14,6 +14,10 @@ from blastjax.core import UNBREAKABLE, Damage
 pytestmark = pytest.mark.usefixtures("strict")
 
 NODES, EDGES = 12, 18
+# Run piece by piece, each of these would compile its loops anew at every call.
+margin_of = jax.jit(soft.margin)
+margin_to_one = jax.jit(soft.margin, static_argnames="to")
+step = jax.jit(fracture.step)
 
 
 def random_graphs(seed, count, ties=False):
@@ -100,21 +104,21 @@ def wall():
 
 def test_margin_agrees_with_split(wall):
     asset, state, blow = wall
-    margin = jax.jit(lambda s, b: soft.margin(asset, s, b))(state, blow)
-    after, _ = fracture.step(asset, state, blow)
+    margin = margin_of(asset, state, blow)
+    after, _ = step(asset, state, blow)
     nodes = asset.span_node.shape[0]
     held = np.asarray(after.actor[:nodes]) == 0
     assert 0 < (~held).sum() < nodes
     np.testing.assert_array_equal(np.asarray(margin) > 0, held)
     # Once it is done, the state alone says the same.
-    now = soft.margin(asset, after)
+    now = margin_of(asset, after)
     np.testing.assert_array_equal(np.asarray(now) > 0, held)
     # To one node, and to a set of nodes.
-    to_last = soft.margin(asset, state, blow, to=nodes - 1)
+    to_last = margin_to_one(asset, state, blow, to=nodes - 1)
     same = np.asarray(after.actor[:nodes]) == int(after.actor[nodes - 1])
     np.testing.assert_array_equal(np.asarray(to_last) > 0, same)
     few = jnp.arange(nodes) % 7 == 3
-    to_few = np.asarray(soft.margin(asset, state, blow, to=few)) > 0
+    to_few = np.asarray(margin_of(asset, state, blow, to=few)) > 0
     np.testing.assert_array_equal(
         to_few, np.isin(after.actor[:nodes], after.actor[:nodes][few])
     )
@@ -133,16 +137,16 @@ def test_margin_knows_broken_unbreakable_and_cut(wall):
     left = np.asarray(soft.bond_margin(asset, odd, cut))
     touched = (np.asarray(asset.bond_nodes) == nodes - 1).any(axis=1)
     assert (left[touched] == -np.inf).all() and (left[~touched] > -np.inf).all()
-    after, _ = fracture.step(asset, odd, cut)
+    after, _ = step(asset, odd, cut)
     np.testing.assert_array_equal(
-        np.asarray(soft.margin(asset, odd, cut)) > 0,
+        np.asarray(margin_of(asset, odd, cut)) > 0,
         np.asarray(after.actor[:nodes]) == 0,
     )
 
 
 def test_losses_count_who_is_on_the_wrong_side(wall):
     asset, state, blow = wall
-    margin = soft.margin(asset, state, blow)
+    margin = margin_of(asset, state, blow)
     loose = margin <= 0
     right = soft.release_loss(asset, margin, loose, temperature=1e-4)
     assert float(right) < 1e-3
@@ -155,9 +159,7 @@ def test_losses_count_who_is_on_the_wrong_side(wall):
     # What bond damage cannot bring about costs infinitely much, with no slope.
     rock = fracture.init(asset, jnp.full(asset.bond_area.shape, UNBREAKABLE))
     cost, slope = jax.value_and_grad(
-        lambda b: soft.release_loss(
-            asset, soft.margin(asset, rock, Damage(bond=b)), one
-        )
+        lambda b: soft.release_loss(asset, margin_of(asset, rock, Damage(bond=b)), one)
     )(blow.bond)
     assert cost == jnp.inf and not slope.any()
 
@@ -177,14 +179,15 @@ def test_perturbed_margin_is_the_mean_and_spreads_its_slope(wall):
         )
         return jnp.sum(jnp.where(jnp.isfinite(noisy), noisy, 0))
 
-    slope = jax.jit(jax.grad(total))
-    sharp, soft_ = slope(state.bond_health, 1e-6), slope(state.bond_health, 0.3)
+    both = jax.jit(jax.value_and_grad(total))
+    mean, sharp = both(state.bond_health, 1e-6)
+    _, soft_ = both(state.bond_health, 0.3)
     assert (np.asarray(soft_) > 0).sum() > (np.asarray(sharp) > 0).sum()
     # One unit of health for all bonds moves every node's margin by one unit.
     nodes = asset.span_node.shape[0] - 1
     np.testing.assert_allclose(soft_.sum(), nodes, rtol=1e-5)
-    hard = soft.margin(asset, state, blow)[1:].sum()
-    np.testing.assert_allclose(total(state.bond_health, 1e-6), hard, atol=1e-3)
+    hard = margin_of(asset, state, blow)[1:].sum()
+    np.testing.assert_allclose(mean, hard, atol=1e-3)
 
 
 def test_margin_refuses(wall):
@@ -360,9 +363,10 @@ def test_moments_in_one_step_in_order_and_late_ones_are_counted():
         )
 
     health = jnp.array([0.3, 0.8], jnp.float32)
+    run = jax.jit(run, static_argnums=1)
     end = run(health, 2)
     np.testing.assert_allclose(end.break_time, [0.3, 0.7], rtol=1e-5)
-    slope = jax.jacrev(lambda h: run(h, 2).break_time)(health)
+    slope = jax.jit(jax.jacrev(lambda h: run(h, 2).break_time))(health)
     np.testing.assert_allclose(slope, [[1, 0], [1, 0.5]], rtol=1e-5)
     few = run(health, 1)
     assert int(few.late) == 1 and int(end.late) == 0
@@ -400,11 +404,14 @@ def test_sharing_conserves_momentum_and_ends_in_rigid_bodies():
         before = momenta(asset, velocity, spin, density)
         bonds = asset.bond_area.shape[0]
 
-        def share(weight, stiffness):
-            v, w = soft.share_velocity(
+        shared = jax.jit(
+            lambda weight, stiffness: soft.share_velocity(
                 asset, weight, velocity, spin, density=density, stiffness=stiffness
             )
-            return np.asarray(v), np.asarray(w)
+        )
+
+        def share(weight, stiffness):
+            return tuple(map(np.asarray, shared(weight, stiffness)))
 
         for weight in (np.zeros(bonds), np.ones(bonds), rng.random(bonds)):
             for a, b in zip(

@@ -1,5 +1,6 @@
 """One table of all public array functions, each under jit, vmap, padding and grad."""
 
+import functools
 import inspect
 
 import jax
@@ -241,10 +242,45 @@ def test_table_is_complete():
     assert public == set(TABLE)
 
 
+@functools.cache
+def compiled(name):
+    """Return a function of the table, compiled once for all tests."""
+    return jax.jit(TABLE[name])
+
+
+worn_once = jax.jit(worn)
+
+
 @pytest.fixture(scope="module")
 def sample():
     asset = small()
-    return asset, jax.jit(worn)(asset)
+    return asset, worn_once(asset)
+
+
+@pytest.fixture(scope="module")
+def padded(sample):
+    asset = author.pad(sample[0], SPARE)
+    return asset, worn_once(asset)
+
+
+HEAVY = {
+    *("chance.expect", "chance.expect_by_flips", "crossing.evolve"),
+    *("margins.perturbed_margin", "margins.hold_loss", "margins.release_loss"),
+}
+"""Dear to compile and made of others of the table; their gradients and padding are
+always checked, the rest by `-m slow`."""
+LOOPS = HEAVY | {
+    *("fracture.apply_buffer", "fracture.split", "fracture.step"),
+    *("graph.bottleneck", "graph.shortest_ways", "margins.margin"),
+}
+"""Without jit these compile piece by piece, which takes longer than with it."""
+
+
+def names(slow):
+    return [
+        pytest.param(name, marks=pytest.mark.slow) if name in slow else name
+        for name in TABLE
+    ]
 
 
 def same(ours, theirs):
@@ -265,14 +301,24 @@ def test_sample_has_actors_of_every_kind(sample):
     assert active[nodes:].any()
 
 
-@pytest.mark.parametrize("name", TABLE)
+@pytest.mark.parametrize("name", names(LOOPS))
 def test_jit_is_eager(name, sample):
-    same(jax.jit(TABLE[name])(*sample, ONE), TABLE[name](*sample, ONE))
+    same(compiled(name)(*sample, ONE), TABLE[name](*sample, ONE))
 
 
-@pytest.mark.parametrize("name", TABLE)
+@pytest.mark.parametrize("name", names(HEAVY))
 def test_vmap_is_a_loop(name, sample):
-    """Over different states, and over different assets as well."""
+    """Over different assets and states."""
+    check_vmap(name, sample, 0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", TABLE)
+def test_vmap_over_states_is_a_loop(name, sample):
+    check_vmap(name, sample, None)
+
+
+def check_vmap(name, sample, axis):
     asset, state = sample
     other = jax.tree.map(lambda x: x, asset).replace(
         bond_nodes=jnp.where(asset.bond_nodes == 2, 3, asset.bond_nodes)
@@ -286,13 +332,11 @@ def test_vmap_is_a_loop(name, sample):
     assets = jax.tree.map(lambda *x: jnp.stack(x), asset, other)
     states = jax.tree.map(lambda *x: jnp.stack(x), state, fresh)
     xs = jnp.array([1.0, 0.8], jnp.float32)
-    f = jax.jit(TABLE[name])
-    for batch, axis in ((states, None), (states, 0)):
-        shared = asset if axis is None else assets
-        many = jax.jit(jax.vmap(TABLE[name], (axis, 0, 0)))(shared, batch, xs)
-        for i, (a, s) in enumerate([(asset, state), (other, fresh)]):
-            one = f(asset if axis is None else a, s, xs[i])
-            same(jax.tree.map(lambda x, i=i: x[i], many), one)
+    which = asset if axis is None else assets
+    many = jax.jit(jax.vmap(TABLE[name], (axis, 0, 0)))(which, states, xs)
+    for i, (a, s) in enumerate([(asset, state), (other, fresh)]):
+        one = compiled(name)(asset if axis is None else a, s, xs[i])
+        same(jax.tree.map(lambda x, i=i: np.asarray(x)[i], many), one)
 
 
 def cut_back(tree, asset: Asset):
@@ -319,13 +363,11 @@ def cut_back(tree, asset: Asset):
 
 
 @pytest.mark.parametrize("name", [name for name in TABLE if name not in RANDOM])
-def test_padding_changes_nothing(name, sample):
+def test_padding_changes_nothing(name, sample, padded):
     asset, state = sample
-    padded = author.pad(asset, SPARE)
-    worn_padded = jax.jit(worn)(padded)
-    same(cut_back(worn_padded, asset), state)
-    found = jax.jit(TABLE[name])(padded, worn_padded, ONE)
-    same(cut_back(found, asset), jax.jit(TABLE[name])(*sample, ONE))
+    same(cut_back(padded[1], asset), state)
+    found = compiled(name)(*padded, ONE)
+    same(cut_back(found, asset), compiled(name)(*sample, ONE))
 
 
 def extremes(asset, state):
