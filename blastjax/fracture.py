@@ -9,6 +9,7 @@ Healths, being sums, have exact derivatives; who belongs to whom is piecewise co
 and a derivative through it misses the jumps.
 """
 
+from collections.abc import Sequence
 from typing import Any, Protocol
 
 import jax
@@ -155,7 +156,7 @@ def _apply_to_chunks(
     if asset.bond_nodes.shape[0]:
         count = chunks.node_count(asset, state)[jnp.maximum(state.actor, 0)]
         cut = (hit & (count > 1))[:num_nodes]
-        loses = cut[asset.bond_nodes[:, 0]] | cut[asset.bond_nodes[:, 1]]
+        loses = _at_either_end(asset.bond_nodes, cut)
         dirty = state.dirty
         if marks:
             dirty = _dirty(asset, state, loses & state.bond_intact) | cut
@@ -183,6 +184,33 @@ def _apply_to_chunks(
         taken = taken + share
         excess = excess + offer
     return state.replace(chunk_health=health), taken, excess
+
+
+@jax.custom_batching.custom_vmap
+def _at_either_end(edges: jax.Array, flag: jax.Array) -> jax.Array:
+    """Return which edges (B, 2) have a node that is flagged (N,)."""
+    return _ends_of_any(edges, flag[None])[0]
+
+
+@_at_either_end.def_vmap
+def _at_either_end_of_many(
+    size: int, is_batched: Sequence[bool], edges: jax.Array, flag: jax.Array
+) -> tuple[jax.Array, bool]:
+    if is_batched[0]:
+        if not is_batched[1]:
+            flag = jnp.broadcast_to(flag, (size, *flag.shape))
+        return jax.vmap(lambda e, x: x[e[:, 0]] | x[e[:, 1]])(edges, flag), True
+    return _ends_of_any(edges, flag), True
+
+
+def _ends_of_any(edges: jax.Array, flag: jax.Array) -> jax.Array:
+    """Do so for copies (T, N), at no cost if nothing is flagged, as most often."""
+    shape = (flag.shape[0], edges.shape[0])
+    return jax.lax.cond(
+        jnp.any(flag),
+        lambda: flag[:, edges[:, 0]] | flag[:, edges[:, 1]],
+        lambda: jnp.zeros(shape, bool),
+    )
 
 
 def _apply_to_bonds(
