@@ -9,6 +9,7 @@ Healths, being sums, have exact derivatives; who belongs to whom is piecewise co
 and a derivative through it misses the jumps.
 """
 
+from collections.abc import Sequence
 from typing import Any, Protocol
 
 import jax
@@ -120,13 +121,22 @@ def apply(asset: Asset, state: State, damage: Damage) -> tuple[State, FractureEv
     Returns:
       The state and what happened. Healths are differentiable in damage and healths.
     """
+    return _apply(asset, state, damage, marks=True)
+
+
+def _apply(
+    asset: Asset, state: State, damage: Damage, marks: bool
+) -> tuple[State, FractureEvents]:
+    """Apply, and mark the dirty nodes unless a split of all actors follows at once."""
     bond_damage = jnp.zeros_like(state.bond_health)
     chunk_damage = excess = jnp.zeros_like(state.chunk_health)
     before = state.bond_intact
     if damage.chunk is not None:
-        state, chunk_damage, excess = _apply_to_chunks(asset, state, damage.chunk)
+        state, chunk_damage, excess = _apply_to_chunks(
+            asset, state, damage.chunk, marks
+        )
     if damage.bond is not None:
-        state, bond_damage = _apply_to_bonds(asset, state, damage.bond)
+        state, bond_damage = _apply_to_bonds(asset, state, damage.bond, marks)
     broken = before & ~state.bond_intact
     return state, FractureEvents(
         bond_damage=bond_damage,
@@ -137,7 +147,7 @@ def apply(asset: Asset, state: State, damage: Damage) -> tuple[State, FractureEv
 
 
 def _apply_to_chunks(
-    asset: Asset, state: State, damage: jax.Array
+    asset: Asset, state: State, damage: jax.Array, marks: bool
 ) -> tuple[State, jax.Array, jax.Array]:
     num_nodes = asset.span_node.shape[0]
     damageable = _damageable(state.chunk_health, state.chunk_unbreakable)
@@ -146,8 +156,10 @@ def _apply_to_chunks(
     if asset.bond_nodes.shape[0]:
         count = chunks.node_count(asset, state)[jnp.maximum(state.actor, 0)]
         cut = (hit & (count > 1))[:num_nodes]
-        loses = cut[asset.bond_nodes[:, 0]] | cut[asset.bond_nodes[:, 1]]
-        dirty = _dirty(asset, state, loses & state.bond_intact) | cut
+        loses = _at_either_end(asset.bond_nodes, cut)
+        dirty = state.dirty
+        if marks:
+            dirty = _dirty(asset, state, loses & state.bond_intact) | cut
         dead = loses & (state.bond_health > 0)
         state = state.replace(
             bond_health=jnp.where(dead, 0, state.bond_health),
@@ -158,6 +170,8 @@ def _apply_to_chunks(
     taken = jnp.where(hit, damage, 0)
     health = state.chunk_health - taken
     excess = jnp.where(hit & (health < 0), -health, 0)
+    if asset.depth == 0:
+        return state.replace(chunk_health=health), taken, excess
     parent = jnp.maximum(asset.element_parent, 0)
     siblings = jnp.maximum(chunks.element_values(asset, asset.chunk_children), 1)
     offer = excess
@@ -172,8 +186,35 @@ def _apply_to_chunks(
     return state.replace(chunk_health=health), taken, excess
 
 
+@jax.custom_batching.custom_vmap
+def _at_either_end(edges: jax.Array, flag: jax.Array) -> jax.Array:
+    """Return which edges (B, 2) have a node that is flagged (N,)."""
+    return _ends_of_any(edges, flag[None])[0]
+
+
+@_at_either_end.def_vmap
+def _at_either_end_of_many(
+    size: int, is_batched: Sequence[bool], edges: jax.Array, flag: jax.Array
+) -> tuple[jax.Array, bool]:
+    if is_batched[0]:
+        if not is_batched[1]:
+            flag = jnp.broadcast_to(flag, (size, *flag.shape))
+        return jax.vmap(lambda e, x: x[e[:, 0]] | x[e[:, 1]])(edges, flag), True
+    return _ends_of_any(edges, flag), True
+
+
+def _ends_of_any(edges: jax.Array, flag: jax.Array) -> jax.Array:
+    """Do so for copies (T, N), at no cost if nothing is flagged, as most often."""
+    shape = (flag.shape[0], edges.shape[0])
+    return jax.lax.cond(
+        jnp.any(flag),
+        lambda: flag[:, edges[:, 0]] | flag[:, edges[:, 1]],
+        lambda: jnp.zeros(shape, bool),
+    )
+
+
 def _apply_to_bonds(
-    asset: Asset, state: State, damage: jax.Array
+    asset: Asset, state: State, damage: jax.Array, marks: bool
 ) -> tuple[State, jax.Array]:
     damageable = _damageable(state.bond_health, state.bond_unbreakable)
     hit = (damage > 0) & damageable
@@ -183,7 +224,7 @@ def _apply_to_bonds(
     state = state.replace(
         bond_health=jnp.where(broken, 0, left),
         bond_intact=state.bond_intact & ~broken,
-        dirty=_dirty(asset, state, broken),
+        dirty=_dirty(asset, state, broken) if marks else state.dirty,
     )
     return state, taken
 
@@ -315,6 +356,6 @@ def step(
     Healths are differentiable, as in `apply`; the split is not: `soft` has derivatives
     that see it.
     """
-    state, fractured = apply(asset, state, damage)
+    state, fractured = _apply(asset, state, damage, marks=False)
     state, parted = split(asset, state)
     return state, (fractured, parted)

@@ -234,7 +234,7 @@ def step(
 
     world = world.replace(
         data=engine.without_matrices(data),
-        bodies=bodies.settle(riding.replace(overlap=found.overlap)),
+        bodies=bodies.settle(scene, riding.replace(overlap=found.overlap)),
         dropped=jax.tree.map(jnp.add, world.dropped, found.dropped),
     )
     events = Events(
@@ -258,8 +258,7 @@ def step(
         damage = strained if damage is None else _add(damage, strained)
         events = events.replace(verdict=verdict)
     assert damage is not None
-    state, broken = fracture.apply(scene.asset, world.state, damage)
-    state, parted = fracture.split(scene.asset, state)
+    state, (broken, parted) = fracture.step(scene.asset, world.state, damage)
     world, removed = _regroup(scene, world, state, parted, remove_dead, grace_steps)
     events = events.replace(
         damage=damage, fracture=broken, split=parted, removed=removed
@@ -451,14 +450,19 @@ def _regroup(
     grace_steps: int | jax.Array,
 ) -> tuple[World, jax.Array]:
     """Remove debris and give the actors of a new state their slots."""
-    before, gone = state, jnp.zeros(state.actor.shape[0], bool)
+    before, debris = state, world.debris
+    gone = jnp.zeros(state.actor.shape[0], bool)
+    # With a slot for every chunk no actor is ever too many.
+    crowded = scene.slots < scene.host.element.size
     if remove_dead:
         gone = _dead(scene, state)
         state = fracture.deactivate(scene.asset, state, gone)
-    light = bodies.outcasts(scene, state)
-    state = fracture.deactivate(scene.asset, state, light)
-    gone = gone | light
-    debris = _swept(scene, world.debris, before, gone)
+    if crowded:
+        light = bodies.outcasts(scene, state)
+        state = fracture.deactivate(scene.asset, state, light)
+        gone = gone | light
+    if remove_dead or crowded:
+        debris = _swept(scene, debris, before, gone)
     riding, data = bodies.reassign(
         scene, world.bodies, world.data, state, parted, grace_steps
     )

@@ -221,18 +221,21 @@ def reassign(
         inertia=jnp.where(used[:, None, None], moments.inertia[pick], eye),
     )
     created = used & parted.created[pick]
-    # What the world holds has a place in the tables too, and is its own heir.
-    holder = parted.created[0] if scene.asset.has_world else False
-    family = jnp.append(origin, slots), jnp.append(created, holder)
-    now = now.replace(
-        grace=_pass_on(bodies.grace, *family, grace_steps),
-        overlap=_pass_on(bodies.overlap, *family, UNMEASURED),
-    )
+    if scene.host.chunk_kinds:
+        # What the world holds has a place in the tables too, and is its own heir.
+        holder = parted.created[0] if scene.asset.has_world else False
+        family = jnp.append(origin, slots), jnp.append(created, holder)
+        now = now.replace(
+            grace=_pass_on(bodies.grace, *family, grace_steps),
+            overlap=_pass_on(bodies.overlap, *family, UNMEASURED),
+        )
     return now, _inherit(scene, bodies, now, data, origin, created)
 
 
-def settle(bodies: Bodies) -> Bodies:
-    """Let one step of grace pass."""
+def settle(scene: Scene, bodies: Bodies) -> Bodies:
+    """Let one step of grace pass, where chunks can collide at all."""
+    if not scene.host.chunk_kinds:
+        return bodies
     return bodies.replace(grace=jnp.maximum(bodies.grace - 1, 0))
 
 
