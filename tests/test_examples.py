@@ -65,6 +65,16 @@ def test_how_strong(capsys, tmp_path):
     assert picture.stat().st_size > 5000
 
 
+@pytest.mark.slow
+def test_soft_landing(capsys, tmp_path):
+    found = load("soft_landing").main(tmp_path / "landing.png")
+    assert found["pieces"][0] > 1 and found["pieces"][1] == 1
+    assert found["lost"][0] > 1 > found["lost"][1]
+    assert abs(found["rest"][0] - 1.5) < 0.1 and found["rest"][1] < 0.1
+    assert found["speed"] < 0.1 and found["random"] > 0.2
+    assert "first throw" in capsys.readouterr().out
+
+
 def test_size_a_beam(capsys):
     after = load("size_a_beam").main(length=4, steps=40)
     np.testing.assert_allclose(after, 2.0, rtol=0.01)
