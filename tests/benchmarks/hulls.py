@@ -2,7 +2,8 @@
 
 Three tables. Compilation and step time of a slab of 64 Voronoi pieces as 64 distinct
 hulls and as 64 boxes, in one process, interleaved. How still and how deep pieces of a
-broken slab and vase lie after they fell. How far single pieces end up from where
+broken slab and vase lie after they fell, and how still MuJoCo C leaves the same hulls
+from 0.1 s after the break. How far single pieces end up from where
 MuJoCo C, with mesh geoms, leaves them. float32, unless --x64.
 """
 
@@ -101,16 +102,25 @@ def rest(kind, sites, seconds=4.0, impratio=10.0, vertices=32):
                 jnp.where(used, state.data.qpos[scene.host.slot_qpos][:, 2], 9)
             )
             residual = events.solver.residual
-            return state, jnp.stack([speed, deep, low, jnp.sum(used), residual])
+            numbers = jnp.stack([speed, deep, low, jnp.sum(used), residual])
+            pose = state.data.qpos[scene.host.slot_qpos]
+            return state, (numbers, pose, moved)
 
         steps = round(seconds / 0.004)
         return jax.lax.scan(one, start, length=steps)
 
-    end, track = run(scene, world.init(scene))
-    track = np.asarray(track)
+    end, found = run(scene, world.init(scene))
+    track, pose, moved = map(np.asarray, found)
     last = track[-50:]
     still = np.flatnonzero(track[:, 0] > 1e-3)
+    broke = int(np.flatnonzero(track[:, 3] == last[-1, 3])[0])
+    after = min(broke + 25, len(track) - 1)
+    start = pose[after], moved[after]
+    peer = rest_in_c(thing, table, end.bodies, start, len(track) - after, impratio)
+    awake = np.flatnonzero(peer > 1e-3)
     return {
+        "c_speed": float(peer[-50:].max()),
+        "c_still_after": float((after + (awake[-1] + 1 if awake.size else 0)) * 0.004),
         "actors": int(last[-1, 3]),
         "speed": float(last[:, 0].max()),
         "penetration": float(last[:, 1].max()),
@@ -121,6 +131,37 @@ def rest(kind, sites, seconds=4.0, impratio=10.0, vertices=32):
         "dropped": int(end.dropped.contacts + end.dropped.pairs),
         "fit": [float(f(hulls.fit_error(thing, table))) for f in (np.min, np.max)],
     }
+
+
+def rest_in_c(thing, table, bodies, start, steps, impratio):
+    """Return the top speed at each step of MuJoCo C, from 0.1 s after the break on."""
+    spec = mujoco.MjSpec.from_string(FLOOR.format(impratio))
+    spec.option.iterations, spec.option.tolerance = 100, 1e-10
+    asset, slot = thing.asset, np.asarray(bodies.slot)
+    chunk, used = np.asarray(asset.element_chunk), np.unique(slot[slot >= 0])
+    for k in used:
+        body = spec.worldbody.add_body()
+        body.add_freejoint()
+        for c in chunk[(slot == k) & (chunk >= 0)]:
+            place = np.asarray(asset.chunk_centroid[c] - bodies.center[k], float)
+            for row in np.flatnonzero(np.asarray(table.chunk) == c):
+                points = np.unique(np.asarray(table.vertices[row], float), axis=0)
+                spec.add_mesh(name=f"m{row}", uservert=(points + place).reshape(-1))
+                body.add_geom(
+                    type=mujoco.mjtGeom.mjGEOM_MESH,
+                    meshname=f"m{row}",
+                    density=1000.0,
+                    friction=[1.0, 0.005, 0.0001],
+                )
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = (x[used].reshape(-1) for x in start)
+    speed = np.zeros(steps)
+    for i in range(steps):
+        mujoco.mj_step(model, data)
+        moved = data.qvel.reshape(-1, 6)[:, :3]
+        speed[i] = np.linalg.norm(moved, axis=1).max()
+    return speed
 
 
 def against_c(count=8, seconds=1.0):
@@ -202,7 +243,9 @@ def main():
                     f"{found['broke_at']:.2f} s, speed {found['speed']:.1e} m/s in the "
                     f"last 0.2 s (below 1e-3 from {found['still_after']:.2f} s), "
                     f"penetration {found['penetration'] * 1e3:.2f} mm, lowest centre "
-                    f"moved {found['lowest_moved']:.1e} m, dropped {found['dropped']}"
+                    f"moved {found['lowest_moved']:.1e} m, dropped {found['dropped']}; "
+                    f"MuJoCo C: speed {found['c_speed']:.1e} m/s (below 1e-3 from "
+                    f"{found['c_still_after']:.2f} s)"
                 )
     if options.only in (None, "c"):
         result["c"] = found = against_c()
