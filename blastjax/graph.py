@@ -6,11 +6,12 @@ dropped: padding needs no special case.
 
 import functools
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from blastjax import lanes
+from blastjax import bottlenecks, lanes
 
 FEW = 8
 """Copies below which sweeps do not pay."""
@@ -67,7 +68,7 @@ def _hook_and_jump(edges: jax.Array, place: jax.Array, alive: jax.Array) -> jax.
     return jax.lax.while_loop(lambda carry: carry[1], hook, start)[0]
 
 
-Kernel = Callable[..., jax.Array]
+Kernel = Callable[..., Any]
 """A search: of edges (B, 2), place (N,), and arrays of what it is to know of them."""
 
 
@@ -81,18 +82,18 @@ def _one(rounds: Kernel, sweeps: Kernel) -> Kernel:
     """
 
     @jax.custom_batching.custom_vmap
-    def one(edges: jax.Array, place: jax.Array, *known: jax.Array) -> jax.Array:
+    def one(edges: jax.Array, place: jax.Array, *known: jax.Array) -> Any:
         return rounds(edges, place, *known)
 
     @one.def_vmap
     def batched(
         size: int, is_batched: Sequence[bool], *args: jax.Array
-    ) -> tuple[jax.Array, bool]:
+    ) -> tuple[Any, Any]:
         edges, place, *known = _full(size, is_batched, args)
         if is_batched[0]:
-            return jax.vmap(rounds)(edges, place, *known), True
+            return _all(jax.vmap(rounds)(edges, place, *known))
         # The place changes no result: that of the first copy is as good as any.
-        return _many(rounds, sweeps)(edges[0], place[0], *known), True
+        return _all(_many(rounds, sweeps)(edges[0], place[0], *known))
 
     return one
 
@@ -102,8 +103,8 @@ def _many(rounds: Kernel, sweeps: Kernel) -> Kernel:
     """Return the search of many copies of one graph."""
 
     @jax.custom_batching.custom_vmap
-    def many(edges: jax.Array, place: jax.Array, *known: jax.Array) -> jax.Array:
-        def each(edges: jax.Array, place: jax.Array, *known: jax.Array) -> jax.Array:
+    def many(edges: jax.Array, place: jax.Array, *known: jax.Array) -> Any:
+        def each(edges: jax.Array, place: jax.Array, *known: jax.Array) -> Any:
             return jax.vmap(lambda *x: rounds(edges, place, *x))(*known)
 
         # A sweep is one long chain of small steps, the wrong thing for an accelerator,
@@ -117,19 +118,25 @@ def _many(rounds: Kernel, sweeps: Kernel) -> Kernel:
     @many.def_vmap
     def batched(
         size: int, is_batched: Sequence[bool], *args: jax.Array
-    ) -> tuple[jax.Array, bool]:
+    ) -> tuple[Any, Any]:
         edges, place, *known = _full(size, is_batched, args)
         if is_batched[0]:
             # Different graphs: together if each has one copy, else one by one.
             if known[0].shape[1] == 1:
                 only = jax.vmap(rounds)(edges, place, *[x[:, 0] for x in known])
-                return only[:, None], True
-            return jax.lax.map(lambda x: many(*x), (edges, place, *known)), True
+                return _all(jax.tree.map(lambda x: x[:, None], only))
+            return _all(jax.lax.map(lambda x: many(*x), (edges, place, *known)))
         copies = [x.reshape(-1, *x.shape[2:]) for x in known]
         found = many(edges[0], place[0], *copies)
-        return found.reshape(*known[0].shape[:2], -1), True
+        shape = known[0].shape[:2]
+        return _all(jax.tree.map(lambda x: x.reshape(*shape, -1), found))
 
     return many
+
+
+def _all(out: Any) -> tuple[Any, Any]:
+    """Say of all that a batching rule returns that it is batched."""
+    return out, jax.tree.map(lambda _: True, out)
 
 
 def _full(
@@ -206,102 +213,31 @@ def bottleneck(
     One graph is solved by Boruvka's rounds. A `vmap` over weights and sources, on the
     CPU, sweeps over all copies side by side instead (see `lanes`).
     """
-    num_edges = edges.shape[0]
-    lowest = jnp.array(-jnp.inf, weight.dtype)
-    if num_edges == 0:
-        none = jnp.full(num_nodes, -1, jnp.int32)
-        return jnp.where(source, jnp.inf, lowest), none
-    # Searches run on constants: nothing in there is differentiated.
-    strength = jax.lax.stop_gradient(weight)
-    strength = jnp.where(strength > lowest, strength, lowest)
+    if edges.shape[0] == 0:
+        least = jnp.where(source, jnp.inf, -jnp.inf).astype(weight.dtype)
+        return least, jnp.full(num_nodes, -1, jnp.int32)
     if place is None:
         place = jnp.arange(num_nodes, dtype=jnp.int32)
-    search = _one(_boruvka, lanes.bottlenecks_in_tiles)
-    cost = lanes.to_rank(-strength)
-    edge = search(edges, jax.lax.stop_gradient(place), cost, source)
-    # Sources and what infinite weights lead to have one past the last edge.
-    found = (edge >= 0) & (edge < num_edges)
-    pick = jnp.where(found, edge, 0)
-    finite = found & jnp.isfinite(strength[pick])
-    bound = jnp.where(found, strength[pick], jnp.where(edge < 0, -jnp.inf, jnp.inf))
-    least = jnp.where(finite, weight[pick], bound.astype(weight.dtype))
-    return least, jnp.where(finite, edge, -1)
+    search = _one(bottlenecks.rounds, bottlenecks.in_tiles)
+    # Searches run on constants: nothing in there is differentiated.
+    least, edge = search(edges, *jax.lax.stop_gradient((place, weight)), source)
+    edge = jnp.where(jnp.isfinite(least), edge, -1)
+    return _as_weight_of(edge, least, weight), edge
 
 
-def _boruvka(
-    edges: jax.Array, place: jax.Array, cost: jax.Array, source: jax.Array
-) -> jax.Array:
-    """Return which edge is the dearest on the cheapest way to a source, (N,) int32.
-
-    Every tree without a source hooks onto the tree behind the cheapest edge that leaves
-    it. No edge inside a tree is dearer than the one by which it hooks, so the maximum
-    along the hooks is the answer, found by pointer doubling.
-
-    Args:
-      edges: (B, 2) nodes.
-      place: (N,) not looked at.
-      cost: (B,) integers.
-      source: (N,) bool.
-
-    Returns:
-      The edge; B at the sources, -1 where no way leads.
-    """
-    num_nodes, num_edges = place.shape[0], edges.shape[0]
-    nodes = jnp.arange(num_nodes, dtype=jnp.int32)
-    first, second = edges[:, 0], edges[:, 1]
-    index = jnp.arange(num_edges, dtype=jnp.int32)
-    top = jnp.array(jnp.iinfo(cost.dtype).max, cost.dtype)
-
-    def hook(
-        carry: tuple[jax.Array, jax.Array, jax.Array, jax.Array],
-    ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-        root, up, edge, _ = carry
-        a, b = root[first], root[second]
-        out = jnp.where(a != b, cost, top)
-        best = jnp.full(num_nodes, top).at[a].min(out).at[b].min(out)
-        # Of equal edges the first: without one order for all, hooks could form rings.
-        at_a = jnp.where((out < top) & (out == best[a]), index, num_edges)
-        at_b = jnp.where((out < top) & (out == best[b]), index, num_edges)
-        pick = jnp.full(num_nodes, num_edges, jnp.int32).at[a].min(at_a).at[b].min(at_b)
-        chosen = jnp.minimum(pick, num_edges - 1)
-        to = jnp.where(a[chosen] == nodes, b[chosen], a[chosen])
-        hooks = (pick < num_edges) & ~source
-        # Two trees that choose the same edge: the one of the lower root stays.
-        hooks = hooks & ~((pick[to] == pick) & ~source[to] & (nodes < to))
-        to = jnp.where(hooks, to, nodes)
-        up, edge = jnp.where(hooks, to, up), jnp.where(hooks, pick, edge)
-        return _ends(to)[root], up, edge, jnp.any(hooks)
-
-    start = nodes, nodes, jnp.full_like(nodes, -1), jnp.array(True)
-    _, up, edge, _ = jax.lax.while_loop(lambda c: c[3], hook, start)
-
-    def double(
-        carry: tuple[jax.Array, jax.Array, jax.Array, jax.Array],
-    ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-        up, dearest, edge, _ = carry
-        dearer = dearest[up] > dearest
-        dearest = jnp.where(dearer, dearest[up], dearest)
-        edge = jnp.where(dearer, edge[up], edge)
-        return up[up], dearest, edge, jnp.any(up[up] != up)
-
-    # Trees that reach no source end at a root of their own.
-    dearest = jnp.where(edge < 0, top, cost[edge])
-    dearest = jnp.where(source, jnp.iinfo(cost.dtype).min, dearest)
-    edge = jnp.where(source, num_edges, edge)
-    carry = up, dearest, edge, jnp.array(True)
-    return jax.lax.while_loop(lambda c: c[3], double, carry)[2]
+@jax.custom_jvp
+def _as_weight_of(edge: jax.Array, value: jax.Array, weight: jax.Array) -> jax.Array:
+    """Return the value, which moves as the weight of the edge, if it is one."""
+    del edge, weight
+    return value
 
 
-def _ends(pointer: jax.Array) -> jax.Array:
-    """Follow (N,) pointers to where they end."""
-
-    def jump(carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        pointer, _ = carry
-        further = pointer[pointer]
-        return further, jnp.any(further != pointer)
-
-    start = (pointer, jnp.array(True))
-    return jax.lax.while_loop(lambda c: c[1], jump, start)[0]
+@_as_weight_of.defjvp
+def _(
+    primals: tuple[jax.Array, ...], tangents: tuple[Any, ...]
+) -> tuple[jax.Array, jax.Array]:
+    edge, value, _ = primals
+    return value, jnp.where(edge >= 0, tangents[2][jnp.maximum(edge, 0)], 0)
 
 
 def group_sum(values: jax.Array, group: jax.Array, num_groups: int) -> jax.Array:

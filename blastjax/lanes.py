@@ -1,4 +1,4 @@
-"""Many copies of one graph side by side: islands and best ways by sweeps over lanes.
+"""Many copies of one graph side by side: islands by sweeps over lanes.
 
 Labels are rows of nodes by columns of copies, so that the neighbour that a node reads
 is one contiguous row for all of them: no scatter, and no gather that differs from copy
@@ -11,7 +11,7 @@ Nodes are visited in an order of their own; labels are node numbers all the same
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -225,115 +225,14 @@ def from_labels(labels: jax.Array) -> jax.Array:
     return flat.reshape(lanes, -1)[:, :num_nodes].astype(jnp.int32)
 
 
-def bottlenecks(
-    way: Order, edges: jax.Array, cost: jax.Array, source: jax.Array
-) -> jax.Array:
-    """Find the ways to sources, in every copy, whose dearest edge is cheapest.
-
-    First the levels, what the dearest edges cost; then which edges these are.
-
-    Args:
-      way: the way through the graph, of N nodes and B edges.
-      edges: (B, 2) nodes.
-      cost: (B + 1, T) signed integers; the last is the greatest there is, no other is
-        that or the least.
-      source: (N, T) bool.
-
-    Returns:
-      (N, T) unsigned, the dearest edge of a best way; of equal edges one on a way that
-      visits no node twice. B at sources, all ones where no way leads.
-    """
-    limits = jnp.iinfo(cost.dtype)
-
-    def dearest(
-        level: jax.Array, here: jax.Array, node: jax.Array, edge: jax.Array
-    ) -> jax.Array:
-        del here
-        return jnp.maximum(_row(level, node), _row(cost, edge))
-
-    start = jnp.where(source, limits.min, limits.max).astype(cost.dtype)
-    level = _settle(start, way, dearest)
-    dtype = np.uint16 if cost.shape[0] < LIMIT else np.uint32
-    none = dtype(np.iinfo(dtype).max)
-
-    def leave(
-        name: jax.Array, here: jax.Array, node: jax.Array, edge: jax.Array
-    ) -> jax.Array:
-        # The dear edge is the one by which the way leaves the nodes of its level.
-        del name
-        near, far = _row(level, here), _row(level, node)
-        leaves = jnp.maximum(far, _row(cost, edge)) == near
-        return jnp.where(leaves & (far < near), edge.astype(dtype), none)
-
-    # All nodes that it can be reached from on their level share its name.
-    a, b = level[edges[:, 0]], level[edges[:, 1]]
-    apart = jnp.where((a == b) & (cost[:-1] <= a), dtype(0), none)
-    apart = jnp.concatenate([apart, jnp.full((1, cost.shape[1]), none)])
-
-    def share(
-        name: jax.Array, here: jax.Array, node: jax.Array, edge: jax.Array
-    ) -> jax.Array:
-        del here
-        return _row(name, node) | _row(apart, edge)
-
-    name = jnp.where(source, dtype(edges.shape[0]), none)
-    for side in (0, 1):
-        name = _sweep(name, way, jnp.int32(side), leave)
-    return _settle(name, way, share)
-
-
-def _settle(
-    rows: jax.Array,
-    way: Order,
-    offer: Callable[[jax.Array, jax.Array, jax.Array, jax.Array], jax.Array],
-) -> jax.Array:
-    """Sweep to and fro until nothing changes."""
-
-    def half(
-        carry: tuple[jax.Array, jax.Array, jax.Array],
-    ) -> tuple[jax.Array, jax.Array, jax.Array]:
-        rows, count, _ = carry
-        new = _sweep(rows, way, count % 2, offer)
-        return new, count + 1, (count == 0) | jnp.any(new != rows)
-
-    start = rows, jnp.int32(0), jnp.array(True)
-    return lax.while_loop(lambda c: c[2], half, start)[0]
-
-
 def in_tiles(edges: jax.Array, place: jax.Array, alive: jax.Array) -> jax.Array:
     """Label the nodes of copies (T, B) of one graph: (T, N) int32."""
     num_nodes = place.shape[0]
     dtype, way = label_dtype(num_nodes), order(edges, num_nodes, place)
-    return _tiled(lambda x: from_labels(islands(way, to_dead(x, dtype))), alive)
+    return tiled(lambda x: from_labels(islands(way, to_dead(x, dtype))), alive)
 
 
-def bottlenecks_in_tiles(
-    edges: jax.Array, place: jax.Array, cost: jax.Array, source: jax.Array
-) -> jax.Array:
-    """Find dearest edges in copies of one graph.
-
-    Args:
-      edges: (B, 2) nodes.
-      place: (N,) see `order`.
-      cost: (T, B) of `to_rank`.
-      source: (T, N) bool.
-
-    Returns:
-      (T, N) int32 edges; B at sources, -1 where no way leads.
-    """
-    num_edges, num_nodes = edges.shape[0], place.shape[0]
-    way = order(edges, num_nodes, place)
-
-    def tile(cost: jax.Array, source: jax.Array) -> jax.Array:
-        none = jnp.full((1, cost.shape[0]), jnp.iinfo(cost.dtype).max, cost.dtype)
-        cost = jnp.concatenate([lax.optimization_barrier(cost.T), none])
-        edge = from_labels(bottlenecks(way, edges, cost, source.T))
-        return jnp.where(edge > num_edges, -1, edge)
-
-    return _tiled(tile, cost, source)
-
-
-def _tiled(tile: Callable[..., jax.Array], *copies: jax.Array) -> jax.Array:
+def tiled(tile: Callable[..., Any], *copies: jax.Array) -> Any:
     """Call tile on so many copies (T, ...) at a time, and join what it returns."""
     size = copies[0].shape[0]
     width = min(LANES, -(-size // 32) * 32)
@@ -345,11 +244,4 @@ def _tiled(tile: Callable[..., jax.Array], *copies: jax.Array) -> jax.Array:
 
     # Not a vmap: every tile stops when it is done.
     found = lax.map(lambda x: tile(*x), tuple(map(split, copies)))
-    return found.reshape(tiles * width, -1)[:size]
-
-
-def to_rank(x: jax.Array) -> jax.Array:
-    """Turn floats into integers of the same order and size; not for NaN."""
-    bits = 8 * x.dtype.itemsize
-    integer = lax.bitcast_convert_type(x, jnp.dtype(f"int{bits}"))
-    return jnp.where(integer < 0, integer ^ jnp.iinfo(integer.dtype).max, integer)
+    return jax.tree.map(lambda x: x.reshape(tiles * width, -1)[:size], found)
