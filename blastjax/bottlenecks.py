@@ -118,13 +118,61 @@ def in_tiles(
 
     def tile(weight: jax.Array, source: jax.Array) -> tuple[jax.Array, jax.Array]:
         cost = jnp.where(loops[None], none, _cost(weight))
-        cost = lax.optimization_barrier(cost.T)
+        row = jnp.full((1, weight.shape[0]), none)
+        cost = jnp.concatenate([lax.optimization_barrier(cost.T), row])
         level, sweep = _levels(way, cost, jnp.where(source.T, free, none))
         step = lanes.from_labels(_steps(way, cost, level, sweep))
         edge = jnp.minimum(_follow(step, num_nodes) - num_nodes, num_edges - 1)
         return _weight(lax.optimization_barrier(level).T, weight.dtype), edge
 
     return lanes.tiled(tile, weight, source)
+
+
+Lowest = Callable[..., jax.Array]
+"""Of way, costs, levels, side, turn and the node's own row: the lowest of offers."""
+
+
+def _by(
+    level: jax.Array, cost: jax.Array, node: jax.Array, edge: jax.Array
+) -> jax.Array:
+    return jnp.maximum(_row(level, node), _row(cost, edge))
+
+
+def _of_degree(degree: int) -> Lowest:
+    def lowest(
+        way: lanes.Order,
+        cost: jax.Array,
+        level: jax.Array,
+        side: jax.Array,
+        i: jax.Array,
+        low: jax.Array,
+    ) -> jax.Array:
+        for j in range(degree):
+            by = _by(level, cost, way.near[side, i, j], way.by[side, i, j])
+            low = jnp.minimum(low, by)
+        return low
+
+    return lowest
+
+
+def _of_hub(
+    way: lanes.Order,
+    cost: jax.Array,
+    level: jax.Array,
+    side: jax.Array,
+    i: jax.Array,
+    low: jax.Array,
+) -> jax.Array:
+    def one(j: jax.Array, low: jax.Array) -> jax.Array:
+        by = _by(level, cost, way.node[side, j], way.edge[side, j])
+        return jnp.minimum(low, by)
+
+    start = way.start[side, i]
+    return lax.fori_loop(start, start + way.degree[side, i], one, low)
+
+
+LOWEST = [*map(_of_degree, lanes.DEGREES), _of_hub]
+"""By the kind of a turn."""
 
 
 def _levels(
@@ -134,7 +182,7 @@ def _levels(
 
     Args:
       way: the way through the graph, of N nodes and B edges.
-      cost: (B, T) of `_cost`.
+      cost: (B + 1, T) of `_cost`, the last row the greatest.
       level: (N, T) least at sources, else greatest.
 
     Returns:
@@ -142,7 +190,6 @@ def _levels(
       backward sweeps, 0 for those that never fell.
     """
     num_nodes, size = level.shape
-    dearest = jnp.full((1, size), jnp.iinfo(level.dtype).max, level.dtype)
 
     def sweep(
         carry: tuple[jax.Array, jax.Array, jax.Array, jax.Array],
@@ -154,22 +201,20 @@ def _levels(
             i: jax.Array, carry: tuple[jax.Array, jax.Array, jax.Array]
         ) -> tuple[jax.Array, jax.Array, jax.Array]:
             level, last, moved = carry
-
-            def offer(low: jax.Array, node: jax.Array, edge: jax.Array) -> jax.Array:
-                return jnp.minimum(
-                    low, jnp.maximum(_row(level, node), _row(cost, edge))
-                )
-
             here = way.visit[side, i]
-            low = _over_neighbours(way, side, i, offer, dearest)
-            fell = low < _row(level, here)
-            rows = (
-                jnp.minimum(low, _row(level, here)),
-                jnp.where(fell, now, _row(last, here)),
-                moved | fell,
-            )
+
+            def branch(lowest: Lowest) -> Callable[..., tuple[jax.Array, ...]]:
+                def rows(level: jax.Array, last: jax.Array) -> tuple[jax.Array, ...]:
+                    old = _row(level, here)
+                    low = lowest(way, cost, level, side, i, old)
+                    when = jnp.where(low < old, now, _row(last, here))
+                    return low, when, moved | (low < old)
+
+                return rows
+
+            found = lax.switch(way.kind[side, i], [*map(branch, LOWEST)], level, last)
             # Without the barrier XLA copies all rows to write one.
-            low, when, moved = lax.optimization_barrier(rows)
+            low, when, moved = lax.optimization_barrier(found)
             return _put(level, low, here), _put(last, when, here), moved
 
         none = jnp.zeros((1, size), bool)
@@ -177,7 +222,7 @@ def _levels(
         # A sweep without a change is the end, for the one before went the other way.
         return level, last, count + 1, (count == 1) | jnp.any(moved)
 
-    last = jnp.zeros(level.shape, _step_dtype(num_nodes, cost.shape[0]))
+    last = jnp.zeros(level.shape, _step_dtype(num_nodes + cost.shape[0]))
     carry = level, last, jnp.int32(1), jnp.array(True)
     return lax.while_loop(lambda c: c[3], sweep, carry)[:2]
 
@@ -201,21 +246,22 @@ def _steps(
       (N, T) unsigned: N + edge where the step is over a bottleneck, else the node to
       step to. N + B where no step leads on.
     """
-    num_nodes, num_edges = level.shape[0], cost.shape[0]
+    num_nodes, num_edges = level.shape[0], cost.shape[0] - 1
 
     def turn(side: jax.Array, i: jax.Array, step: jax.Array) -> jax.Array:
         here = way.visit[side, i]
         near, when = _row(level, here), _row(last, here)
 
-        def offer(best: jax.Array, node: jax.Array, edge: jax.Array) -> jax.Array:
+        def offer(j: jax.Array, best: jax.Array) -> jax.Array:
+            node, edge = way.node[side, j], way.edge[side, j]
             far, price = _row(level, node), _row(cost, edge)
             leads = jnp.maximum(far, price) == near
             before = (_row(last, node) <= when) | (far < near)
             to = jnp.where(price == near, num_nodes + edge, node).astype(best.dtype)
             return jnp.where(leads & before, to, best)
 
-        none = jnp.full_like(when, num_nodes + num_edges)
-        best = _over_neighbours(way, side, i, offer, none)
+        start, none = way.start[side, i], jnp.full_like(when, num_nodes + num_edges)
+        best = lax.fori_loop(start, start + way.degree[side, i], offer, none)
         mine = when % 2 == side.astype(when.dtype)
         best = jnp.where(mine, best, _row(step, here))
         return _put(step, lax.optimization_barrier(best), here)
@@ -241,22 +287,6 @@ def _follow(step: jax.Array, num_nodes: int) -> jax.Array:
     return lax.while_loop(lambda c: c[1], double, (step, jnp.array(True)))[0]
 
 
-def _over_neighbours(
-    way: lanes.Order,
-    side: jax.Array,
-    i: jax.Array,
-    offer: Callable[[jax.Array, jax.Array, jax.Array], jax.Array],
-    row: jax.Array,
-) -> jax.Array:
-    """Fold offer(row, node, edge) over the neighbours that a sweep has visited."""
-
-    def one(j: jax.Array, row: jax.Array) -> jax.Array:
-        return offer(row, way.node[side, j], way.edge[side, j])
-
-    start = way.start[side, i]
-    return lax.fori_loop(start, start + way.degree[side, i], one, row)
-
-
 def _row(x: jax.Array, i: jax.Array) -> jax.Array:
     return x.at[i].get(mode="promise_in_bounds")[None]
 
@@ -265,8 +295,8 @@ def _put(x: jax.Array, row: jax.Array, i: jax.Array) -> jax.Array:
     return lax.dynamic_update_slice(x, row, (i, jnp.int32(0)))
 
 
-def _step_dtype(num_nodes: int, num_edges: int) -> type[np.unsignedinteger]:
-    return np.uint16 if num_nodes + num_edges <= np.iinfo(np.uint16).max else np.uint32
+def _step_dtype(steps: int) -> type[np.unsignedinteger]:
+    return np.uint16 if steps <= lanes.LIMIT else np.uint32
 
 
 def _cost(weight: jax.Array) -> jax.Array:

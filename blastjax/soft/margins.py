@@ -108,7 +108,10 @@ def margin(
 
 def _margin(asset: Asset, weight: jax.Array, source: jax.Array) -> jax.Array:
     num_nodes = asset.span_node.shape[0]
-    return graph.bottleneck(asset.bond_nodes, weight, source, num_nodes)[0]
+    across = chunks.element_values(asset, asset.chunk_centroid)[:num_nodes, 0]
+    return graph.bottleneck(asset.bond_nodes, weight, source, num_nodes, place=across)[
+        0
+    ]
 
 
 def perturbed_margin(
