@@ -158,30 +158,32 @@ def least(calls, repeats):
 
 def measure(name, place, edges, alive, cpp, repeats):
     num_nodes, batch = len(place), len(alive)
-    ours = jax.jit(
-        jax.vmap(lambda e, a: graph.islands(e, a, num_nodes), in_axes=(None, 0))
-    )
     e, a = jnp.asarray(edges), jnp.asarray(alive)
+    across = jnp.asarray(place @ graph.ACROSS, jnp.float32)
+
+    @jax.jit
+    def ours(e, across, a):
+        return jax.vmap(lambda x: graph.islands(e, x, num_nodes, place=across))(a)
+
     start = time.perf_counter()
-    ours = ours.lower(e, a).compile()
+    ours = ours.lower(e, across, a).compile()
     compiled = time.perf_counter() - start
     label = np.zeros((batch, num_nodes), np.int32)
     few = alive[:24]
     calls = {
         "cpp": lambda: cpp(edges, alive, label),
-        "vmap": lambda: jax.block_until_ready(ours(e, a)),
+        "vmap": lambda: jax.block_until_ready(ours(e, across, a)),
         "scipy": lambda: scipys(edges, few, num_nodes),
     }
     if batch >= lanes.LANES:
-        dtype = lanes.label_dtype(num_nodes)
-        way = jax.jit(lanes.order, static_argnums=1)(e, num_nodes)
+        way = jax.jit(lanes.order, static_argnums=1)(e, num_nodes, across)
         tiles = a.reshape(-1, lanes.LANES, len(edges))
-        dead = jax.jit(lambda x: lax.map(lambda y: lanes.to_dead(y, dtype), x))(tiles)
+        kept = jnp.array(tiles.swapaxes(1, 2))
         rollout = jax.jit(lambda w, x: lax.map(lambda y: lanes.islands(w, y), x))
-        calls["lanes"] = lambda: jax.block_until_ready(rollout(way, dead))
+        calls["lanes"] = lambda: jax.block_until_ready(rollout(way, kept))
         calls["lanes"]()
     times = least(calls, repeats)
-    np.testing.assert_array_equal(ours(e, a), label)
+    np.testing.assert_array_equal(ours(e, across, a), label)
     row = {"asset": name, "nodes": num_nodes, "bonds": len(edges), "batch": batch}
     for key, seconds in times.items():
         row[key] = 1e6 * seconds / (len(few) if key == "scipy" else batch)
