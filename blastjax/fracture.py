@@ -292,8 +292,7 @@ def split(
     chosen = old != NONE
     if actors is not None:
         chosen = chosen & actors[jnp.maximum(old, 0)]
-    place = chunks.element_values(asset, asset.chunk_centroid)[:num_nodes]
-    across = place @ graph.ACROSS.astype(place.dtype)
+    across = chunks.element_values(asset, asset.chunk_centroid)[:num_nodes, 0]
     label = graph.islands(asset.bond_nodes, state.bond_intact, num_nodes, place=across)
     label = jnp.where(chosen[:num_nodes], label, old[:num_nodes])
     actor = old.at[:num_nodes].set(label)

@@ -9,14 +9,11 @@ from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from blastjax import lanes
 
 FEW = 8
 """Copies below which sweeps do not pay."""
-ACROSS = np.array([4.0, 2.0, 1.0])
-"""A direction askew to all axes: few nodes next to each other along it are joined."""
 
 
 def islands(
@@ -32,9 +29,8 @@ def islands(
       edges: (B, 2) nodes.
       alive: (B,) bool, the edges that connect.
       num_nodes: N.
-      place: (N,) a coordinate along which most edges are short, but few of them join
-        next nodes, such as that along `ACROSS`. It changes no result, only how fast
-        batches are; None takes the numbers of the nodes.
+      place: (N,) a coordinate along which most edges are short. It changes no result,
+        only how fast batches are; None takes the numbers of the nodes.
 
     Returns:
       (N,) int32 labels. Piecewise constant: it has no derivative to speak of.

@@ -88,6 +88,16 @@ def order(edges: jax.Array, num_nodes: int, place: jax.Array | None = None) -> O
     early, late = jnp.minimum(a, b), jnp.maximum(a, b)
     ways = _side(late, early, nodes), _side(early, late, nodes)
     near, by, start, degree, node, edge = map(jnp.stack, zip(*ways, strict=True))
+    # Level by level nothing else comes before its turn, but more goes into a group.
+    level = _levels(near[0, :num_nodes])
+    busy = jnp.minimum(jnp.sum(degree[:, :num_nodes], axis=0), 63)
+    rows = jnp.argsort(64 * level + busy).astype(jnp.int32)
+    to = nodes.at[rows].set(nodes, unique_indices=True)
+    tail = jnp.arange(GROUP, dtype=jnp.int32) + num_nodes
+    rows, beyond = jnp.concatenate([rows, tail]), jnp.concatenate([to, tail])
+    visit, near, node = visit[rows[:num_nodes]], beyond[near[:, rows]], to[node]
+    turn, by, start, degree = to[turn], by[:, rows], start[:, rows], degree[:, rows]
+    early, late = to[early], to[late]
     # A pair of a node with itself is padding.
     before = jnp.where(early < late, early, -1)
     last = jnp.full_like(nodes, -1).at[late].max(before)
@@ -102,6 +112,18 @@ def order(edges: jax.Array, num_nodes: int, place: jax.Array | None = None) -> O
     )
     groups = group[-1] + 1
     return Order(visit, turn, groups, first, kind, near, by, start, degree, node, edge)
+
+
+def _levels(near: jax.Array) -> jax.Array:
+    """Return how long a chain of neighbours (N, K) before it each row ends, (N,)."""
+
+    def one(row: jax.Array, level: jax.Array) -> jax.Array:
+        before = lax.dynamic_index_in_dim(near, row, keepdims=False)
+        top = jnp.max(jnp.where(before == row, -1, level[before])) + 1
+        return lax.dynamic_update_index_in_dim(level, top, row, 0)
+
+    start = jnp.zeros(near.shape[0], jnp.int32)
+    return lax.fori_loop(0, near.shape[0], one, start)
 
 
 def _groups(last: jax.Array) -> jax.Array:
