@@ -110,32 +110,21 @@ def in_tiles(
     Returns:
       (T, N) weights and (T, N) edges, see `rounds`.
     """
-    num_edges, num_nodes = edges.shape[0], place.shape[0]
-    way = lanes.order(edges, num_nodes, place)
-    free, none = _bounds(weight.dtype)
-    # A step must not lead to where it began.
-    loops = edges[:, 0] == edges[:, 1]
+    way = lanes.order(edges, place.shape[0], place)
 
     def tile(weight: jax.Array, source: jax.Array) -> tuple[jax.Array, jax.Array]:
-        cost = jnp.where(loops[None], none, _cost(weight))
-        row = jnp.full((1, weight.shape[0]), none)
-        cost = jnp.concatenate([lax.optimization_barrier(cost.T), row])
-        level, sweep = _levels(way, cost, jnp.where(source.T, free, none))
-        step = lanes.from_labels(_steps(way, cost, level, sweep))
-        edge = jnp.minimum(_follow(step, num_nodes) - num_nodes, num_edges - 1)
-        return _weight(lax.optimization_barrier(level).T, weight.dtype), edge
+        cost, (free, none) = _cost(weight), _bounds(weight.dtype)
+        source = jnp.pad(_rows(source, way.visit), ((0, lanes.GROUP), (0, 0)))
+        level, last = _levels(way, cost, jnp.where(source, free, none))
+        edge = _follow(_steps(way, cost, level, last), cost.shape[0])
+        return _rows(level, way.turn), edge
 
-    return lanes.tiled(tile, weight, source)
-
-
-Lowest = Callable[..., jax.Array]
-"""Of way, costs, levels, side, turn and the node's own row: the lowest of offers."""
+    level, edge = lanes.tiled(tile, weight, source)
+    return _weight(level, weight.dtype), edge.astype(jnp.int32)
 
 
-def _by(
-    level: jax.Array, cost: jax.Array, node: jax.Array, edge: jax.Array
-) -> jax.Array:
-    return jnp.maximum(_row(level, node), _row(cost, edge))
+Lowest = Callable[[lanes.Order, jax.Array, jax.Array, jax.Array, jax.Array], jax.Array]
+"""Of way, costs, levels, side and the first row of a group: the lowest of offers."""
 
 
 def _of_degree(degree: int) -> Lowest:
@@ -144,12 +133,17 @@ def _of_degree(degree: int) -> Lowest:
         cost: jax.Array,
         level: jax.Array,
         side: jax.Array,
-        i: jax.Array,
-        low: jax.Array,
+        first: jax.Array,
     ) -> jax.Array:
+        low = _group(level, first)
+        if degree == 0:
+            return low
+        at, size = (side, first, jnp.uint32(0)), (1, lanes.GROUP, degree)
+        near = lax.dynamic_slice(way.near, at, size)[0]
+        by = lax.dynamic_slice(way.by, at, size)[0]
         for j in range(degree):
-            by = _by(level, cost, way.near[side, i, j], way.by[side, i, j])
-            low = jnp.minimum(low, by)
+            offer = jnp.maximum(_rows(level, near[:, j]), _rows(cost, by[:, j]))
+            low = jnp.minimum(low, offer)
         return low
 
     return lowest
@@ -160,19 +154,41 @@ def _of_hub(
     cost: jax.Array,
     level: jax.Array,
     side: jax.Array,
-    i: jax.Array,
-    low: jax.Array,
+    first: jax.Array,
 ) -> jax.Array:
-    def one(j: jax.Array, low: jax.Array) -> jax.Array:
-        by = _by(level, cost, way.node[side, j], way.edge[side, j])
-        return jnp.minimum(low, by)
+    def lower(low: jax.Array, near: jax.Array, by: jax.Array) -> jax.Array:
+        return jnp.minimum(low, jnp.maximum(_rows(level, near), _rows(cost, by)))
 
-    start = way.start[side, i]
-    return lax.fori_loop(start, start + way.degree[side, i], one, low)
+    return _over_neighbours(way, side, first, lower, _group(level, first))
 
 
-LOWEST = [*map(_of_degree, lanes.DEGREES), _of_hub]
-"""By the kind of a turn."""
+LOWEST: list[Lowest] = [*map(_of_degree, lanes.DEGREES), _of_hub]
+"""By the kind of a group."""
+
+
+def _over_neighbours(
+    way: lanes.Order,
+    side: jax.Array,
+    first: jax.Array,
+    fold: Callable[[jax.Array, jax.Array, jax.Array], jax.Array],
+    rows: jax.Array,
+) -> jax.Array:
+    """Fold rows of a group with a neighbour of each (n,) and the edge to it (n,).
+
+    Rows that have fewer neighbours than others are their own, by any edge.
+    """
+    at, size = (side, first), (1, lanes.GROUP)
+    start = lax.dynamic_slice(way.start, at, size)[0]
+    degree = lax.dynamic_slice(way.degree, at, size)[0]
+    own = first + jnp.arange(lanes.GROUP, dtype=jnp.uint32)
+    last = jnp.uint32(way.node.shape[1] - 1)
+
+    def one(j: jax.Array, rows: jax.Array) -> jax.Array:
+        entry = jnp.minimum(start + j, last)
+        near = jnp.where(j < degree, way.node[side][entry], own)
+        return fold(rows, near, way.edge[side][entry])
+
+    return lax.fori_loop(jnp.uint32(0), jnp.max(degree), one, rows)
 
 
 def _levels(
@@ -182,14 +198,15 @@ def _levels(
 
     Args:
       way: the way through the graph, of N nodes and B edges.
-      cost: (B + 1, T) of `_cost`, the last row the greatest.
-      level: (N, T) least at sources, else greatest.
+      cost: (B, T) of `_cost`.
+      level: (N + GROUP, T) by row, least at sources, else greatest.
 
     Returns:
-      (N, T) levels, and (N, T) unsigned, the sweep in which each fell last: odd for
-      backward sweeps, 0 for those that never fell.
+      Levels, and the sweep in which each fell last, unsigned: odd for backward sweeps,
+      0 for those that never fell. (N + GROUP, T) each.
     """
-    num_nodes, size = level.shape
+    last = jnp.zeros(level.shape, _step_dtype(way.visit.shape[0] + cost.shape[0]))
+    none = jnp.zeros((lanes.GROUP, level.shape[1]), bool)
 
     def sweep(
         carry: tuple[jax.Array, jax.Array, jax.Array, jax.Array],
@@ -197,33 +214,32 @@ def _levels(
         level, last, count, _ = carry
         side, now = count % 2, count.astype(last.dtype)
 
-        def turn(
+        def visit(
             i: jax.Array, carry: tuple[jax.Array, jax.Array, jax.Array]
         ) -> tuple[jax.Array, jax.Array, jax.Array]:
             level, last, moved = carry
-            here = way.visit[side, i]
+            i = jnp.where(side == 0, i, way.groups - 1 - i)
+            first = way.first[i]
 
             def branch(lowest: Lowest) -> Callable[..., tuple[jax.Array, ...]]:
                 def rows(level: jax.Array, last: jax.Array) -> tuple[jax.Array, ...]:
-                    old = _row(level, here)
-                    low = lowest(way, cost, level, side, i, old)
-                    when = jnp.where(low < old, now, _row(last, here))
-                    return low, when, moved | (low < old)
+                    low = lowest(way, cost, level, side, first)
+                    fell = low < _group(level, first)
+                    when = jnp.where(fell, now, _group(last, first))
+                    return low, when, moved | fell
 
                 return rows
 
             found = lax.switch(way.kind[side, i], [*map(branch, LOWEST)], level, last)
-            # Without the barrier XLA copies all rows to write one.
+            # Without the barrier XLA copies all rows to write a few.
             low, when, moved = lax.optimization_barrier(found)
-            return _put(level, low, here), _put(last, when, here), moved
+            return _put(level, low, first), _put(last, when, first), moved
 
-        none = jnp.zeros((1, size), bool)
-        level, last, moved = lax.fori_loop(0, num_nodes, turn, (level, last, none))
+        level, last, moved = lax.fori_loop(0, way.groups, visit, (level, last, none))
         # A sweep without a change is the end, for the one before went the other way.
         return level, last, count + 1, (count == 1) | jnp.any(moved)
 
-    last = jnp.zeros(level.shape, _step_dtype(num_nodes + cost.shape[0]))
-    carry = level, last, jnp.int32(1), jnp.array(True)
+    carry = level, last, jnp.uint32(1), jnp.array(True)
     return lax.while_loop(lambda c: c[3], sweep, carry)[:2]
 
 
@@ -232,67 +248,73 @@ def _steps(
 ) -> jax.Array:
     """Find from where each node has its level.
 
-    A node fell last by a neighbour that its sweep had visited before. If their edge
-    does not cost the level, the neighbour has it too, and had it before: so steps to
-    such neighbours never go round in circles.
+    A node fell last by a neighbour on that side of it. If their edge does not cost the
+    level, the neighbour has it too, and had it before: so steps to such neighbours
+    never go round in circles.
 
     Args:
       way: see `_levels`.
       cost: see `_levels`.
-      level: (N, T) of `_levels`.
-      last: (N, T) of `_levels`.
+      level: of `_levels`.
+      last: of `_levels`.
 
     Returns:
-      (N, T) unsigned: N + edge where the step is over a bottleneck, else the node to
-      step to. N + B where no step leads on.
+      (N, T) by node, unsigned: the edge where the step is over a bottleneck, else B +
+      the node to step to. Edge 0 where no step leads on.
     """
-    num_nodes, num_edges = level.shape[0], cost.shape[0] - 1
+    num_edges = cost.shape[0]
+    names = jnp.pad(way.visit, (0, lanes.GROUP)) + num_edges
 
-    def turn(side: jax.Array, i: jax.Array, step: jax.Array) -> jax.Array:
-        here = way.visit[side, i]
-        near, when = _row(level, here), _row(last, here)
+    def visit(side: jax.Array, i: jax.Array, step: jax.Array) -> jax.Array:
+        first = way.first[i]
+        own = first + jnp.arange(lanes.GROUP, dtype=jnp.uint32)
+        here, when = _group(level, first), _group(last, first)
 
-        def offer(j: jax.Array, best: jax.Array) -> jax.Array:
-            node, edge = way.node[side, j], way.edge[side, j]
-            far, price = _row(level, node), _row(cost, edge)
-            leads = jnp.maximum(far, price) == near
-            before = (_row(last, node) <= when) | (far < near)
-            to = jnp.where(price == near, num_nodes + edge, node).astype(best.dtype)
-            return jnp.where(leads & before, to, best)
+        def find(best: jax.Array, near: jax.Array, by: jax.Array) -> jax.Array:
+            there, price = _rows(level, near), _rows(cost, by)
+            leads = (jnp.maximum(there, price) == here) & (near != own)[:, None]
+            before = (_rows(last, near) <= when) | (there < here)
+            over, on = (x.astype(best.dtype)[:, None] for x in (by, names[near]))
+            return jnp.where(leads & before, jnp.where(price == here, over, on), best)
 
-        start, none = way.start[side, i], jnp.full_like(when, num_nodes + num_edges)
-        best = lax.fori_loop(start, start + way.degree[side, i], offer, none)
+        best = _over_neighbours(way, side, first, find, jnp.zeros_like(when))
         mine = when % 2 == side.astype(when.dtype)
-        best = jnp.where(mine, best, _row(step, here))
-        return _put(step, lax.optimization_barrier(best), here)
+        best = jnp.where(mine, best, _group(step, first))
+        return _put(step, lax.optimization_barrier(best), first)
 
     step = jnp.zeros_like(last)
     for side in (0, 1):
-        step = lax.fori_loop(
-            0, num_nodes, functools.partial(turn, jnp.int32(side)), step
-        )
-    return step
+        one = functools.partial(visit, jnp.uint32(side))
+        step = lax.fori_loop(0, way.groups, one, step)
+    return _rows(step, way.turn)
 
 
-def _follow(step: jax.Array, num_nodes: int) -> jax.Array:
-    """Follow (T, N) steps from node to node to what is none, by pointer doubling."""
+def _follow(step: jax.Array, num_edges: int) -> jax.Array:
+    """Follow steps (N, T) from node to node to an edge, by pointer doubling."""
 
     def double(carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         step, _ = carry
-        node = jnp.minimum(step, num_nodes - 1)
-        next_ = jnp.take_along_axis(step, node, axis=1, mode="promise_in_bounds")
-        step = jnp.where(step < num_nodes, next_, step)
-        return step, jnp.any(step < num_nodes)
+        node = jnp.maximum(step.astype(jnp.int32) - num_edges, 0)
+        then = jnp.take_along_axis(step, node, axis=0, mode="promise_in_bounds")
+        step = jnp.where(step < num_edges, step, then)
+        return step, jnp.any(step >= num_edges)
 
     return lax.while_loop(lambda c: c[1], double, (step, jnp.array(True)))[0]
 
 
-def _row(x: jax.Array, i: jax.Array) -> jax.Array:
-    return x.at[i].get(mode="promise_in_bounds")[None]
+def _rows(x: jax.Array, i: jax.Array) -> jax.Array:
+    """Return rows i (n,) of x."""
+    dims = lax.GatherDimensionNumbers((1,), (0,), (0,))
+    sizes = (1, x.shape[1])
+    return lax.gather(x, i[:, None], dims, sizes, mode="promise_in_bounds")
 
 
-def _put(x: jax.Array, row: jax.Array, i: jax.Array) -> jax.Array:
-    return lax.dynamic_update_slice(x, row, (i, jnp.int32(0)))
+def _group(x: jax.Array, first: jax.Array) -> jax.Array:
+    return lax.dynamic_slice(x, (first, jnp.uint32(0)), (lanes.GROUP, x.shape[1]))
+
+
+def _put(x: jax.Array, rows: jax.Array, first: jax.Array) -> jax.Array:
+    return lax.dynamic_update_slice(x, rows, (first, jnp.uint32(0)))
 
 
 def _step_dtype(steps: int) -> type[np.unsignedinteger]:
