@@ -113,9 +113,9 @@ def in_tiles(
     way = lanes.order(edges, place.shape[0], place)
 
     def tile(weight: jax.Array, source: jax.Array) -> tuple[jax.Array, jax.Array]:
-        cost, (free, none) = _cost(weight), _bounds(weight.dtype)
-        source = jnp.pad(_rows(source, way.visit), ((0, lanes.GROUP), (0, 0)))
-        level, last = _levels(way, cost, jnp.where(source, free, none))
+        cost, (free, none) = lanes.to_lanes(_cost(weight)), _bounds(weight.dtype)
+        start = jnp.where(_rows(lanes.to_lanes(source), way.visit), free, none)
+        level, last = _levels(way, cost, start)
         edge = _follow(_steps(way, cost, level, last), cost.shape[0])
         return _rows(level, way.turn), edge
 
@@ -124,7 +124,7 @@ def in_tiles(
 
 
 Lowest = Callable[[lanes.Order, jax.Array, jax.Array, jax.Array, jax.Array], jax.Array]
-"""Of way, costs, levels, side and the first row of a group: the lowest of offers."""
+"""Of way, costs, levels, side and row: the lowest of what it has and is offered."""
 
 
 def _of_degree(degree: int) -> Lowest:
@@ -133,17 +133,12 @@ def _of_degree(degree: int) -> Lowest:
         cost: jax.Array,
         level: jax.Array,
         side: jax.Array,
-        first: jax.Array,
+        row: jax.Array,
     ) -> jax.Array:
-        low = _group(level, first)
-        if degree == 0:
-            return low
-        at, size = (side, first, jnp.uint32(0)), (1, lanes.GROUP, degree)
-        near = lax.dynamic_slice(way.near, at, size)[0]
-        by = lax.dynamic_slice(way.by, at, size)[0]
+        low = _row(level, row)
         for j in range(degree):
-            offer = jnp.maximum(_rows(level, near[:, j]), _rows(cost, by[:, j]))
-            low = jnp.minimum(low, offer)
+            near, by = way.near[side, row, j], way.by[side, row, j]
+            low = jnp.minimum(low, jnp.maximum(_row(level, near), _row(cost, by)))
         return low
 
     return lowest
@@ -154,41 +149,32 @@ def _of_hub(
     cost: jax.Array,
     level: jax.Array,
     side: jax.Array,
-    first: jax.Array,
+    row: jax.Array,
 ) -> jax.Array:
     def lower(low: jax.Array, near: jax.Array, by: jax.Array) -> jax.Array:
-        return jnp.minimum(low, jnp.maximum(_rows(level, near), _rows(cost, by)))
+        return jnp.minimum(low, jnp.maximum(_row(level, near), _row(cost, by)))
 
-    return _over_neighbours(way, side, first, lower, _group(level, first))
+    return _over_neighbours(way, side, row, lower, _row(level, row))
 
 
 LOWEST: list[Lowest] = [*map(_of_degree, lanes.DEGREES), _of_hub]
-"""By the kind of a group."""
+"""By how many neighbours a row has at most; beyond that, any number."""
 
 
 def _over_neighbours(
     way: lanes.Order,
     side: jax.Array,
-    first: jax.Array,
+    row: jax.Array,
     fold: Callable[[jax.Array, jax.Array, jax.Array], jax.Array],
-    rows: jax.Array,
+    start: jax.Array,
 ) -> jax.Array:
-    """Fold rows of a group with a neighbour of each (n,) and the edge to it (n,).
+    """Fold a row's neighbours on one side, and the edges to them, one by one."""
 
-    Rows that have fewer neighbours than others are their own, by any edge.
-    """
-    at, size = (side, first), (1, lanes.GROUP)
-    start = lax.dynamic_slice(way.start, at, size)[0]
-    degree = lax.dynamic_slice(way.degree, at, size)[0]
-    own = first + jnp.arange(lanes.GROUP, dtype=jnp.uint32)
-    last = jnp.uint32(way.node.shape[1] - 1)
+    def one(j: jax.Array, folded: jax.Array) -> jax.Array:
+        return fold(folded, way.node[side, j], way.edge[side, j])
 
-    def one(j: jax.Array, rows: jax.Array) -> jax.Array:
-        entry = jnp.minimum(start + j, last)
-        near = jnp.where(j < degree, way.node[side][entry], own)
-        return fold(rows, near, way.edge[side][entry])
-
-    return lax.fori_loop(jnp.uint32(0), jnp.max(degree), one, rows)
+    first = way.start[side, row]
+    return lax.fori_loop(first, first + way.degree[side, row], one, start)
 
 
 def _levels(
@@ -199,14 +185,18 @@ def _levels(
     Args:
       way: the way through the graph, of N nodes and B edges.
       cost: (B, T) of `_cost`.
-      level: (N + GROUP, T) by row, least at sources, else greatest.
+      level: (N, T) by row, least at sources, else greatest.
 
     Returns:
       Levels, and the sweep in which each fell last, unsigned: odd for backward sweeps,
-      0 for those that never fell. (N + GROUP, T) each.
+      0 for those that never fell. (N, T) each.
     """
-    last = jnp.zeros(level.shape, _step_dtype(way.visit.shape[0] + cost.shape[0]))
-    none = jnp.zeros((lanes.GROUP, level.shape[1]), bool)
+    num_rows, size = level.shape
+    # Row by row: groups, as for islands, would visit more than they save.
+    steps = jnp.array(lanes.DEGREES, jnp.uint32)
+    kind = jnp.sum(way.degree[..., None] > steps[None, None], axis=-1, dtype=jnp.int32)
+    last = jnp.zeros(level.shape, _step_dtype(num_rows + cost.shape[0]))
+    none = jnp.zeros((1, size), bool)
 
     def sweep(
         carry: tuple[jax.Array, jax.Array, jax.Array, jax.Array],
@@ -218,24 +208,24 @@ def _levels(
             i: jax.Array, carry: tuple[jax.Array, jax.Array, jax.Array]
         ) -> tuple[jax.Array, jax.Array, jax.Array]:
             level, last, moved = carry
-            i = jnp.where(side == 0, i, way.groups - 1 - i)
-            first = way.first[i]
+            row = jnp.where(side == 0, i, jnp.uint32(num_rows - 1) - i)
 
             def branch(lowest: Lowest) -> Callable[..., tuple[jax.Array, ...]]:
-                def rows(level: jax.Array, last: jax.Array) -> tuple[jax.Array, ...]:
-                    low = lowest(way, cost, level, side, first)
-                    fell = low < _group(level, first)
-                    when = jnp.where(fell, now, _group(last, first))
+                def new(level: jax.Array, last: jax.Array) -> tuple[jax.Array, ...]:
+                    low = lowest(way, cost, level, side, row)
+                    fell = low < _row(level, row)
+                    when = jnp.where(fell, now, _row(last, row))
                     return low, when, moved | fell
 
-                return rows
+                return new
 
-            found = lax.switch(way.kind[side, i], [*map(branch, LOWEST)], level, last)
-            # Without the barrier XLA copies all rows to write a few.
+            found = lax.switch(kind[side, row], [*map(branch, LOWEST)], level, last)
+            # Without the barrier XLA copies all rows to write one.
             low, when, moved = lax.optimization_barrier(found)
-            return _put(level, low, first), _put(last, when, first), moved
+            return _put(level, low, row), _put(last, when, row), moved
 
-        level, last, moved = lax.fori_loop(0, way.groups, visit, (level, last, none))
+        start, stop = jnp.uint32(0), jnp.uint32(num_rows)
+        level, last, moved = lax.fori_loop(start, stop, visit, (level, last, none))
         # A sweep without a change is the end, for the one before went the other way.
         return level, last, count + 1, (count == 1) | jnp.any(moved)
 
@@ -262,30 +252,28 @@ def _steps(
       (N, T) by node, unsigned: the edge where the step is over a bottleneck, else B +
       the node to step to. Edge 0 where no step leads on.
     """
-    num_edges = cost.shape[0]
-    names = jnp.pad(way.visit, (0, lanes.GROUP)) + num_edges
+    num_rows, num_edges = level.shape[0], cost.shape[0]
 
-    def visit(side: jax.Array, i: jax.Array, step: jax.Array) -> jax.Array:
-        first = way.first[i]
-        own = first + jnp.arange(lanes.GROUP, dtype=jnp.uint32)
-        here, when = _group(level, first), _group(last, first)
+    def visit(side: jax.Array, row: jax.Array, step: jax.Array) -> jax.Array:
+        here, when = _row(level, row), _row(last, row)
 
         def find(best: jax.Array, near: jax.Array, by: jax.Array) -> jax.Array:
-            there, price = _rows(level, near), _rows(cost, by)
-            leads = (jnp.maximum(there, price) == here) & (near != own)[:, None]
-            before = (_rows(last, near) <= when) | (there < here)
-            over, on = (x.astype(best.dtype)[:, None] for x in (by, names[near]))
-            return jnp.where(leads & before, jnp.where(price == here, over, on), best)
+            there, price = _row(level, near), _row(cost, by)
+            leads = (jnp.maximum(there, price) == here) & (near != row)
+            before = (_row(last, near) <= when) | (there < here)
+            on = num_edges + way.visit[near].astype(by.dtype)
+            to = jnp.where(price == here, by, on)
+            return jnp.where(leads & before, to.astype(best.dtype), best)
 
-        best = _over_neighbours(way, side, first, find, jnp.zeros_like(when))
+        best = _over_neighbours(way, side, row, find, jnp.zeros_like(when))
         mine = when % 2 == side.astype(when.dtype)
-        best = jnp.where(mine, best, _group(step, first))
-        return _put(step, lax.optimization_barrier(best), first)
+        best = jnp.where(mine, best, _row(step, row))
+        return _put(step, lax.optimization_barrier(best), row)
 
     step = jnp.zeros_like(last)
     for side in (0, 1):
         one = functools.partial(visit, jnp.uint32(side))
-        step = lax.fori_loop(0, way.groups, one, step)
+        step = lax.fori_loop(jnp.uint32(0), jnp.uint32(num_rows), one, step)
     return _rows(step, way.turn)
 
 
@@ -309,12 +297,12 @@ def _rows(x: jax.Array, i: jax.Array) -> jax.Array:
     return lax.gather(x, i[:, None], dims, sizes, mode="promise_in_bounds")
 
 
-def _group(x: jax.Array, first: jax.Array) -> jax.Array:
-    return lax.dynamic_slice(x, (first, jnp.uint32(0)), (lanes.GROUP, x.shape[1]))
+def _row(x: jax.Array, i: jax.Array) -> jax.Array:
+    return lax.dynamic_slice(x, (i, jnp.uint32(0)), (1, x.shape[1]))
 
 
-def _put(x: jax.Array, rows: jax.Array, first: jax.Array) -> jax.Array:
-    return lax.dynamic_update_slice(x, rows, (first, jnp.uint32(0)))
+def _put(x: jax.Array, row: jax.Array, i: jax.Array) -> jax.Array:
+    return lax.dynamic_update_slice(x, row, (i, jnp.uint32(0)))
 
 
 def _step_dtype(steps: int) -> type[np.unsignedinteger]:

@@ -316,11 +316,12 @@ def _total(rows: jax.Array) -> jax.Array:
 def in_tiles(edges: jax.Array, place: jax.Array, alive: jax.Array) -> jax.Array:
     """Label the nodes of copies (T, B) of one graph: (T, N) int32."""
     way = order(edges, place.shape[0], place)
-    return tiled(lambda x: islands(way, x), alive).astype(jnp.int32)
+    found = tiled(lambda x: islands(way, to_lanes(x)), alive)
+    return found.astype(jnp.int32)
 
 
 def tiled(tile: Callable[..., Any], *copies: jax.Array) -> Any:
-    """Call tile on so many copies (T, ...) at a time, as lanes, join what returns."""
+    """Call tile on so many copies (T, n) at a time, and join the lanes it returns."""
     size = copies[0].shape[0]
     width = min(LANES, -(-size // BLOCK) * BLOCK)
     tiles = -(-size // width)
@@ -330,7 +331,7 @@ def tiled(tile: Callable[..., Any], *copies: jax.Array) -> Any:
         return x.reshape(tiles, width, -1)
 
     # Not a vmap: every tile stops when it is done.
-    found = lax.map(lambda x: tile(*map(_to_lanes, x)), tuple(map(split, copies)))
+    found = lax.map(lambda x: tile(*x), tuple(map(split, copies)))
 
     def join(x: jax.Array) -> jax.Array:
         return x.swapaxes(1, 2).reshape(tiles * width, -1)[:size]
@@ -338,7 +339,7 @@ def tiled(tile: Callable[..., Any], *copies: jax.Array) -> Any:
     return jax.tree.map(join, found)
 
 
-def _to_lanes(x: jax.Array) -> jax.Array:
+def to_lanes(x: jax.Array) -> jax.Array:
     """Turn copies (T, n) into lanes (n, T)."""
     # By blocks: more rows at once would lie on more pages than a core keeps at hand.
     # Behind barriers: fused with what makes or reads it, a transpose is slow.
