@@ -157,7 +157,7 @@ def stress_damage(
 ) -> Damage:
     """Return the health that the judged stress takes from bonds; see `limits.damage`.
 
-    Unbreakable bonds take none.
+    Unbreakable bonds take none. Differentiable as that is.
     """
     health = state.bond_health
     if state.bond_unbreakable is not None:
@@ -306,7 +306,8 @@ def excess(
 
     Returns:
       Force (A, 3) N and torque (A, 3) N m on each actor, by label, rest frame. What the
-      world holds has a row too.
+      world holds has a row too. Differentiable; which bonds broke, and what came apart,
+      is constant.
     """
     own = material_limits.effective(limits)
     fatal = own.replace(

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from blastjax import pytree, spatial
+from blastjax.core import UNBREAKABLE
 
 Scalar = float | jax.Array
 
@@ -51,7 +52,7 @@ class BondStress(pytree.Node):
 def effective(limits: Limits) -> Limits:
     """Return the limits with the inherited ones filled in.
 
-    Elastic and fatal limits inherit each by itself.
+    Elastic and fatal limits inherit each by itself. Differentiable, exactly.
     """
     elastic = jnp.asarray(limits.compression_elastic)
     fatal = jnp.asarray(limits.compression_fatal)
@@ -150,6 +151,8 @@ def utilisation(
       limits: of one material, or of M.
       stress: of the bonds.
       material: (B,) int32, the material of each bond; None if there is one only.
+
+    Differentiable; where two of them tie, half of each.
     """
     own = _of_bonds(limits, material, stress.normal)
 
@@ -173,7 +176,10 @@ def _faces(stress: BondStress) -> list[jax.Array]:
 def overstressed(
     limits: Limits, stress: BondStress, material: jax.Array | None = None
 ) -> jax.Array:
-    """Return which bonds exceed an elastic limit, (B,) bool."""
+    """Return which bonds exceed an elastic limit, (B,) bool.
+
+    Piecewise constant: no derivative passes.
+    """
     own = _of_bonds(limits, material, stress.normal)
     over = stress.shear > own.shear_elastic
     for normal in _faces(stress):
@@ -197,8 +203,11 @@ def damage(
     Args:
       limits: of one material, or of M.
       stress: of the bonds.
-      health: (B,) of the bonds; those without any take no damage.
+      health: (B,) of the bonds; those without any, and from UNBREAKABLE up, take no
+        damage.
       material: (B,) int32, the material of each bond; None if there is one only.
+
+    Differentiable; misses the jump where limits do not leave room between them.
     """
     own = _of_bonds(limits, material, stress.normal)
 
@@ -215,4 +224,6 @@ def damage(
         face = jnp.where(-normal > own.compression_elastic, pressed, pulled)
         share = jnp.maximum(share, face)
     share = share + part(stress.shear, own.shear_elastic, own.shear_fatal)
-    return jnp.where((health > 0) & (share > 0), share * health, 0)
+    # Of no use where nothing can break, and beyond all numbers.
+    taken = (health > 0) & (health < UNBREAKABLE) & (share > 0)
+    return jnp.where(taken, share * jnp.where(taken, health, 0), 0)

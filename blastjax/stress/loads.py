@@ -22,20 +22,26 @@ class Load(pytree.Node):
 
 
 def node_mass(asset: Asset, density: float | jax.Array) -> jax.Array:
-    """Return the mass of each node, (N,) kg; density is one or (C,), kg/m^3."""
+    """Return the mass of each node, (N,) kg; density is one or (C,), kg/m^3.
+
+    Differentiable, exactly.
+    """
     volume = asset.chunk_volume
     density = jnp.broadcast_to(jnp.asarray(density, volume.dtype), volume.shape)
     return chunks.element_values(asset, density * volume)[: asset.span_node.shape[0]]
 
 
 def node_place(asset: Asset) -> jax.Array:
-    """Return the centroid of each node's chunk, (N, 3) m."""
+    """Return the centroid of each node's chunk, (N, 3) m. Differentiable, exactly."""
     place = chunks.element_values(asset, asset.chunk_centroid)
     return place[: asset.span_node.shape[0]]
 
 
 def gravity(mass: jax.Array, acceleration: jax.Array) -> Load:
-    """Return the load of one acceleration (3,) on all nodes of mass (N,), m/s^2."""
+    """Return the load of one acceleration (3,) on all nodes of mass (N,), m/s^2.
+
+    Differentiable, exactly.
+    """
     force = mass[:, None] * jnp.asarray(acceleration, mass.dtype)[None]
     return Load(force=force, torque=jnp.zeros_like(force))
 
@@ -46,7 +52,7 @@ def centrifugal(
     """Return the outward load of a spin (3,), rad/s, about a centre (3,), m.
 
     Blast's load of this name points inward, as it stands there; this one is what the
-    spinning body feels.
+    spinning body feels. Differentiable, exactly.
     """
     arm = node_place(asset) - jnp.asarray(center, mass.dtype)[None]
     turn = jnp.broadcast_to(jnp.asarray(spin, mass.dtype), arm.shape)
@@ -55,7 +61,10 @@ def centrifugal(
 
 
 def at_node(asset: Asset, node: jax.Array | int, force: jax.Array) -> Load:
-    """Return the load of a force (3,) at the centroid of one node, N."""
+    """Return the load of a force (3,) at the centroid of one node, N.
+
+    Differentiable in the force, exactly.
+    """
     here = jnp.arange(asset.span_node.shape[0], dtype=jnp.int32) == node
     force = jnp.asarray(force, asset.chunk_centroid.dtype)[None]
     force = jnp.where(here[:, None], force, 0)
@@ -78,6 +87,8 @@ def at_position(
       position: where the force acts, m; its arm to the node makes a torque.
       force: N.
       actors: (A,) bool by label, the actors it may act on; None for all.
+
+    Differentiable in the force and in places; misses that another node may be nearer.
     """
     num_nodes = asset.span_node.shape[0]
     place = node_place(asset)
@@ -95,7 +106,7 @@ def at_position(
 
 
 def add(first: Load, *others: Load) -> Load:
-    """Return the sum of loads."""
+    """Return the sum of loads. Differentiable, exactly."""
     total = first
     for load in others:
         total = jax.tree.map(jnp.add, total, load)

@@ -131,6 +131,8 @@ def bodies(asset: Asset, density: float | jax.Array) -> Bodies:
     Args:
       asset: the asset.
       density: kg/m^3, one for all or (C,).
+
+    Differentiable, exactly.
     """
     count = asset.span_node.shape[0]
     volume = asset.chunk_volume
@@ -337,7 +339,8 @@ def excess(
 
     Returns:
       Force (A, 3) N and torque (A, 3) N m on each actor, by label. A bond counts if it
-      broke since the update and leads to another actor or to the world.
+      broke since the update and leads to another actor or to the world. Differentiable;
+      which bonds count is constant.
     """
     count = state.actor.shape[0]
     own = material.effective(limits)
