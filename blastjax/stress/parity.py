@@ -483,8 +483,8 @@ def _solve(
             square=square,
             step=s.step + (~done).astype(jnp.int32),
             done=done,
-            error_linear=jnp.sqrt(linear),
-            error_angular=jnp.sqrt(angular),
+            error_linear=_root(linear),
+            error_angular=_root(angular),
         )
 
     first = _Search(
@@ -498,6 +498,12 @@ def _solve(
         error_angular=zero,
     )
     return jax.lax.while_loop(more, step, first)
+
+
+def _root(square: jax.Array) -> jax.Array:
+    """Return the root, without the slope of it at zero."""
+    some = square > 0
+    return jnp.where(some, jnp.sqrt(jnp.where(some, square, 1)), 0)
 
 
 def _direction(asset: Asset, bodies: Bodies) -> tuple[jax.Array, jax.Array]:
