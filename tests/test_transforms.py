@@ -461,6 +461,7 @@ def padded(sample):
 HEAVY = {
     *("chance.expect", "chance.expect_by_flips", "crossing.evolve"),
     *("margins.perturbed_margin", "margins.hold_loss", "margins.release_loss"),
+    *("failure.excess", "failure.stress_damage", "parity.excess", "limits.damage"),
 }
 """Dear to compile and made of others of the table; their gradients and padding are
 always checked, the rest by `-m slow`."""
@@ -607,7 +608,7 @@ def thrown(asset, state, x, made, bears=False):
     """Return what two boxes do that hit the floor, hurt, and may bear their loads."""
     scene = made.scene.replace(asset=asset)
     impact = world.Impact(
-        threshold=x, hardness=2.0 * x, min_radius=0.5 * x, max_radius=0.9 * x
+        threshold=x, hardness=1.0 + x, min_radius=0.5 * x, max_radius=0.9 * x
     )
     start = world.init(scene, state, velocity=DOWN * x, spin=UP * x)
     load = world.Stress(made.structure["force"], LIMITS) if bears else None
