@@ -372,7 +372,7 @@ def _total(rows: jax.Array) -> jax.Array:
 def in_tiles(edges: jax.Array, place: jax.Array, alive: jax.Array) -> jax.Array:
     """Label the nodes of copies (T, B) of one graph: (T, N) int32."""
     way = order(edges, place.shape[0], place)
-    return _tiled(lambda x: islands(way, x), alive)
+    return tiled(lambda x: islands(way, x), jnp.int32, alive)
 
 
 def bottlenecks_in_tiles(
@@ -390,12 +390,23 @@ def bottlenecks_in_tiles(
       (T, N) int32 edges; B at sources, -1 where no way leads.
     """
     way = order(edges, place.shape[0], place)
-    edge = _tiled(lambda *x: bottlenecks(way, edges, *x), cost, source)
+    edge = tiled(lambda *x: bottlenecks(way, edges, *x), jnp.int32, cost, source)
     return jnp.where(edge > edges.shape[0], -1, edge)
 
 
-def _tiled(tile: Callable[..., jax.Array], *copies: jax.Array) -> jax.Array:
-    """Call tile on so many copies (T, ...) at a time, as lanes, join what returns."""
+def tiled(
+    tile: Callable[..., jax.Array], dtype: jax.typing.DTypeLike, *copies: jax.Array
+) -> jax.Array:
+    """Call a function of lanes on some copies at a time.
+
+    Args:
+      tile: of arrays (n, lanes), as many as `copies`: (m, lanes).
+      dtype: of the result.
+      copies: arrays (T, n).
+
+    Returns:
+      (T, m).
+    """
     size = copies[0].shape[0]
     width = min(LANES, -(-size // BLOCK) * BLOCK)
     tiles = -(-size // width)
@@ -406,8 +417,9 @@ def _tiled(tile: Callable[..., jax.Array], *copies: jax.Array) -> jax.Array:
 
     # Not a vmap: every tile stops when it is done.
     found = lax.map(lambda x: tile(*map(_to_lanes, x)), tuple(map(split, copies)))
-    found = found.swapaxes(1, 2).astype(jnp.int32)
-    return found.reshape(tiles * width, -1)[:size]
+    found = found.swapaxes(1, 2).astype(dtype).reshape(tiles * width, -1)[:size]
+    # Or everything that reads it would turn it anew.
+    return lax.optimization_barrier(found)
 
 
 def _to_lanes(x: jax.Array) -> jax.Array:
