@@ -113,13 +113,13 @@ def in_tiles(
     way = lanes.order(edges, place.shape[0], place)
 
     def tile(weight: jax.Array, source: jax.Array) -> tuple[jax.Array, jax.Array]:
-        cost, (free, none) = lanes.to_lanes(_cost(weight)), _bounds(weight.dtype)
-        start = jnp.where(_rows(lanes.to_lanes(source), way.visit), free, none)
+        cost, (free, none) = _cost(weight), _bounds(weight.dtype)
+        start = jnp.where(_rows(source, way.visit), free, none)
         level, last = _levels(way, cost, start)
         edge = _follow(_steps(way, cost, level, last), cost.shape[0])
         return _rows(level, way.turn), edge
 
-    level, edge = lanes.tiled(tile, weight, source)
+    level, edge = lanes.tiled(tile, None, weight, source)
     return _weight(level, weight.dtype), edge.astype(jnp.int32)
 
 

@@ -206,9 +206,11 @@ def _at_either_end_of_many(
 def _ends_of_any(edges: jax.Array, flag: jax.Array) -> jax.Array:
     """Do so for copies (T, N), at no cost if nothing is flagged, as most often."""
     shape = (flag.shape[0], edges.shape[0])
+    # One by one: a gather of all at once would leave its result the other way round in
+    # memory, whether it is taken or not, and all that reads it would be slow.
     return jax.lax.cond(
         jnp.any(flag),
-        lambda: flag[:, edges[:, 0]] | flag[:, edges[:, 1]],
+        lambda: jax.lax.map(lambda x: x[edges[:, 0]] | x[edges[:, 1]], flag),
         lambda: jnp.zeros(shape, bool),
     )
 
@@ -232,8 +234,8 @@ def _apply_to_bonds(
 def _dirty(asset: Asset, state: State, removed: jax.Array) -> jax.Array:
     if removed.shape[0] == 0:
         return state.dirty
-    first, second = asset.bond_nodes[:, 0], asset.bond_nodes[:, 1]
-    return state.dirty.at[first].max(removed).at[second].max(removed)
+    ends, both = asset.bond_nodes.T.reshape(-1), jnp.concatenate([removed, removed])
+    return state.dirty | graph.group_any(both, ends, state.dirty.shape[0])
 
 
 def apply_buffer(
@@ -313,10 +315,9 @@ def split(
         state = state.replace(actor=jnp.where(released, NONE, actor))
 
     here = chunks.active(asset, state)
-    ones = jnp.ones(capacity, jnp.int32)
-    size_before = graph.group_sum(ones, old, capacity)
-    size_after = graph.group_sum(ones, state.actor, capacity)
-    same = (size_before[jnp.maximum(origin, 0)] == size_after) & (old == origin)
+    # An actor that keeps its label is another one if anything left it.
+    left = graph.group_any(state.actor != old, old, capacity)
+    same = (old == state.actor) & ~left
     return state, SplitEvents(
         parent=jnp.where(here, origin, NONE),
         created=here & ~same,

@@ -316,12 +316,24 @@ def _total(rows: jax.Array) -> jax.Array:
 def in_tiles(edges: jax.Array, place: jax.Array, alive: jax.Array) -> jax.Array:
     """Label the nodes of copies (T, B) of one graph: (T, N) int32."""
     way = order(edges, place.shape[0], place)
-    found = tiled(lambda x: islands(way, to_lanes(x)), alive)
-    return found.astype(jnp.int32)
+    return tiled(lambda x: islands(way, x), jnp.int32, alive)
 
 
-def tiled(tile: Callable[..., Any], *copies: jax.Array) -> Any:
-    """Call tile on so many copies (T, n) at a time, and join the lanes it returns."""
+def tiled(
+    tile: Callable[..., Any],
+    dtype: jax.typing.DTypeLike | None,
+    *copies: jax.Array,
+) -> Any:
+    """Call a function of lanes on some copies at a time.
+
+    Args:
+      tile: of arrays (n, lanes), as many as `copies`: (m, lanes), one or several.
+      dtype: of the result; None as it is.
+      copies: arrays (T, n).
+
+    Returns:
+      (T, m), one or several.
+    """
     size = copies[0].shape[0]
     width = min(LANES, -(-size // BLOCK) * BLOCK)
     tiles = -(-size // width)
@@ -331,15 +343,17 @@ def tiled(tile: Callable[..., Any], *copies: jax.Array) -> Any:
         return x.reshape(tiles, width, -1)
 
     # Not a vmap: every tile stops when it is done.
-    found = lax.map(lambda x: tile(*x), tuple(map(split, copies)))
+    found = lax.map(lambda x: tile(*map(_to_lanes, x)), tuple(map(split, copies)))
 
     def join(x: jax.Array) -> jax.Array:
-        return x.swapaxes(1, 2).reshape(tiles * width, -1)[:size]
+        x = x.swapaxes(1, 2).astype(dtype or x.dtype)
+        return x.reshape(tiles * width, -1)[:size]
 
-    return jax.tree.map(join, found)
+    # Or everything that reads it would turn it anew.
+    return lax.optimization_barrier(jax.tree.map(join, found))
 
 
-def to_lanes(x: jax.Array) -> jax.Array:
+def _to_lanes(x: jax.Array) -> jax.Array:
     """Turn copies (T, n) into lanes (n, T)."""
     # By blocks: more rows at once would lie on more pages than a core keeps at hand.
     # Behind barriers: fused with what makes or reads it, a transpose is slow.
