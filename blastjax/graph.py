@@ -302,7 +302,10 @@ def group_any(flags: jax.Array, group: jax.Array, num_groups: int) -> jax.Array:
 
 
 def group_count(group: jax.Array, num_groups: int) -> jax.Array:
-    """Return how many entries (n,) name each group, (num_groups,) int32."""
+    """Return how many entries (n,) name each group, (num_groups,) int32.
+
+    Piecewise constant: no derivative passes.
+    """
     return _scattered(num_groups, int)(jnp.ones(group.shape, bool), group)
 
 
