@@ -280,7 +280,8 @@ def main():
             result["rest"][name] = found
             print(
                 f"{name}: {found['actors']} pieces, "
-                f"broke at {found['broke_at']:.2f} s, speed {found['speed']:.1e} m/s in the last 0.2 s (below 1e-3 from "
+                f"broke at {found['broke_at']:.2f} s, "
+                f"speed {found['speed']:.1e} m/s in the last 0.2 s (below 1e-3 from "
                 f"{found['still_after']:.2f} s), "
                 f"penetration {found['penetration'] * 1e3:.2f} mm, lowest centre "
                 f"moved {found['lowest_moved']:.1e} m, dropped {found['dropped']}; "
