@@ -29,12 +29,12 @@ def mjx_promotion():
         yield
 
 
-def scene(resting, cubes=2, **options):
+def scene(resting, cubes=2, sunk=1e-4, **options):
     return build(
         shapes.grid((cubes, 1, 1), EDGE),
         friction=FRICTION,
         model=FLOOR,
-        position=(0, 0, -1e-4),
+        position=(0, 0, -sunk),
         resting=resting,
         **options,
     )
@@ -133,7 +133,8 @@ def test_flight_is_untouched_and_keeps_momentum(block):
 
 
 def test_a_rolling_ball_slows_down_by_the_resistance():
-    case = scene(Resting(resistance=0.1), cubes=1, collision="sphere")
+    # As deep as it lies: what is pushed out of the floor is not resisted.
+    case = scene(Resting(resistance=0.1), cubes=1, sunk=6.9e-6, collision="sphere")
     # Of a cube's inertia, on a ball that touches its faces: it rolls without slip.
     size = np.sqrt(1 + (0.5**2 / 6) / 0.25**2)
 
@@ -147,7 +148,7 @@ def test_a_rolling_ball_slows_down_by_the_resistance():
 
     (way, speed), (slope, _) = jit(lambda x: jax.jvp(travel, (x,), (1.0,)))(1.0)
     duration, loss = 100 * TIMESTEP, 0.1 * GRAVITY / size
-    assert speed == pytest.approx(1 - loss * duration, rel=0.03)
+    assert speed == pytest.approx(1 - loss * duration, rel=0.02)
     assert way == pytest.approx(duration - loss * duration**2 / 2, rel=0.02)
     assert slope == pytest.approx(duration, rel=0.02)
 
