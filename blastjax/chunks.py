@@ -71,7 +71,7 @@ def node_count(asset: Asset, state: State) -> jax.Array:
     Piecewise constant: no derivative passes.
     """
     owner = state.actor[: asset.span_node.shape[0]]
-    return graph.group_sum(jnp.ones_like(owner), owner, state.actor.shape[0])
+    return graph.group_count(owner, state.actor.shape[0])
 
 
 def alone(asset: Asset, state: State) -> jax.Array:
@@ -138,20 +138,48 @@ def owner(asset: Asset, state: State) -> jax.Array:
 
     Piecewise constant: no derivative passes.
     """
-    direct = _take(state.actor, asset.chunk_element, NONE)
     if asset.height == 0:
-        return direct
+        return _take(state.actor, asset.chunk_element, NONE)
+    return graph.side_by_side(_owner, 3)(*_tree(asset), _small(state.actor))
+
+
+def _tree(asset: Asset) -> tuple[jax.Array, jax.Array, jax.Array]:
+    return asset.chunk_element, asset.chunk_span, asset.span_node
+
+
+def _small(actor: jax.Array) -> jax.Array:
+    """Return labels in the smallest type that holds them: half the memory to move."""
+    fits = actor.shape[0] <= jnp.iinfo(jnp.int16).max
+    return actor.astype(jnp.int16) if fits else actor
+
+
+def _owner(
+    element: jax.Array, span: jax.Array, node: jax.Array, actor: jax.Array
+) -> jax.Array:
+    """Return the owners of chunks, by the elements' actors (A,)."""
+    direct = _take(actor, element, NONE)
     # In depth-first order a subtree is a range: it has one owner if no neighbours in
     # the range differ, which a running count of differences tells.
-    label = state.actor[asset.span_node]
+    label = actor[node]
     differs = jnp.concatenate([jnp.zeros(1, bool), label[1:] != label[:-1]])
-    count = jnp.cumsum(differs.astype(jnp.int32))
-    first = asset.chunk_span[:, 0]
-    last = jnp.maximum(asset.chunk_span[:, 1] - 1, first)
-    some = asset.chunk_span[:, 1] > first
-    one = some & (count[last] == count[first])
-    above = asset.chunk_element < 0
-    return jnp.where(above, jnp.where(one, label[first], NONE), direct)
+    count = graph.running_count(differs)
+    first = span[:, 0]
+    last = jnp.maximum(span[:, 1] - 1, first)
+    one = (span[:, 1] > first) & (count[last] == count[first])
+    whole = jnp.where(one, label[first], jnp.asarray(NONE, actor.dtype))
+    return jnp.where(element < 0, whole, direct)
+
+
+def _visible(
+    element: jax.Array,
+    span: jax.Array,
+    node: jax.Array,
+    parent: jax.Array,
+    actor: jax.Array,
+) -> jax.Array:
+    """Return which chunks are visible, by the elements' actors (A,)."""
+    owner = _owner(element, span, node, actor)
+    return (owner != NONE) & (_take(owner, parent, NONE) != owner)
 
 
 def visible(asset: Asset, state: State) -> jax.Array:
@@ -159,9 +187,10 @@ def visible(asset: Asset, state: State) -> jax.Array:
 
     Piecewise constant: no derivative passes.
     """
-    chunk_owner = owner(asset, state)
-    parent_owner = _take(chunk_owner, asset.chunk_parent, NONE)
-    return (chunk_owner != NONE) & (parent_owner != chunk_owner)
+    if asset.height == 0 and asset.depth == 0:
+        return owner(asset, state) != NONE
+    see = graph.side_by_side(_visible, 4, bool)
+    return see(*_tree(asset), asset.chunk_parent, _small(state.actor))
 
 
 def moments(asset: Asset, state: State, density: float | jax.Array) -> Moments:

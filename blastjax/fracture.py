@@ -206,9 +206,11 @@ def _at_either_end_of_many(
 def _ends_of_any(edges: jax.Array, flag: jax.Array) -> jax.Array:
     """Do so for copies (T, N), at no cost if nothing is flagged, as most often."""
     shape = (flag.shape[0], edges.shape[0])
+    # One by one: a gather of all at once would leave its result the other way round in
+    # memory, whether it is taken or not, and all that reads it would be slow.
     return jax.lax.cond(
         jnp.any(flag),
-        lambda: flag[:, edges[:, 0]] | flag[:, edges[:, 1]],
+        lambda: jax.lax.map(lambda x: x[edges[:, 0]] | x[edges[:, 1]], flag),
         lambda: jnp.zeros(shape, bool),
     )
 
@@ -313,10 +315,9 @@ def split(
         state = state.replace(actor=jnp.where(released, NONE, actor))
 
     here = chunks.active(asset, state)
-    ones = jnp.ones(capacity, jnp.int32)
-    size_before = graph.group_sum(ones, old, capacity)
-    size_after = graph.group_sum(ones, state.actor, capacity)
-    same = (size_before[jnp.maximum(origin, 0)] == size_after) & (old == origin)
+    # An actor that keeps its label is another one if anything left it.
+    left = graph.group_any(state.actor != old, old, capacity)
+    same = (old == state.actor) & ~left
     return state, SplitEvents(
         parent=jnp.where(here, origin, NONE),
         created=here & ~same,

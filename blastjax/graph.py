@@ -45,7 +45,7 @@ def islands(
         place = jnp.arange(num_nodes, dtype=jnp.int32)
     if num_nodes >= lanes.LIMIT:
         return _hook_and_jump(edges, place, alive)
-    search = _one(_hook_and_jump, lanes.in_tiles)
+    search = _one(_hook_and_jump, lanes.in_tiles, 2)
     return search(edges, jax.lax.stop_gradient(place), alive)
 
 
@@ -68,77 +68,102 @@ def _hook_and_jump(edges: jax.Array, place: jax.Array, alive: jax.Array) -> jax.
 
 
 Kernel = Callable[..., jax.Array]
-"""A search: of edges (B, 2), place (N,), and arrays of what it is to know of them."""
+"""Of arrays that describe an asset, and arrays of one state of it: an array (n,)."""
 
 
 @functools.cache
-def _one(rounds: Kernel, sweeps: Kernel) -> Kernel:
-    """Return the search of one graph, which knows what a batch of it should do.
+def side_by_side(
+    one: Kernel, num_tables: int, dtype: jax.typing.DTypeLike = jnp.int32
+) -> Kernel:
+    """Return the same function, which a batch of states computes in lanes.
 
     Args:
-      rounds: searches one graph.
-      sweeps: searches many copies of one graph; all but edges and place is (T, ...).
+      one: of `num_tables` arrays that describe the asset, and arrays (n,) of a state.
+        Constant under differentiation.
+      num_tables: so many arguments all states share.
+      dtype: of the result.
+    """
+
+    def rounds(*args: jax.Array) -> jax.Array:
+        return one(*args).astype(dtype)
+
+    def sweeps(*args: jax.Array) -> jax.Array:
+        tables, states = args[:num_tables], args[num_tables:]
+        tile = jax.vmap(functools.partial(one, *tables), in_axes=-1, out_axes=-1)
+        return lanes.tiled(tile, dtype, *states)
+
+    return _one(rounds, sweeps, num_tables)
+
+
+@functools.cache
+def _one(rounds: Kernel, sweeps: Kernel, num_tables: int) -> Kernel:
+    """Return a function of one state, which knows what a batch of states should do.
+
+    Args:
+      rounds: does it for one state.
+      sweeps: does it for many states of one asset; all but the tables is (T, ...).
+      num_tables: so many arguments describe the asset.
     """
 
     @jax.custom_batching.custom_vmap
-    def one(edges: jax.Array, place: jax.Array, *known: jax.Array) -> jax.Array:
-        return rounds(edges, place, *known)
+    def one(*args: jax.Array) -> jax.Array:
+        return rounds(*args)
 
     @one.def_vmap
     def batched(
         size: int, is_batched: Sequence[bool], *args: jax.Array
     ) -> tuple[jax.Array, bool]:
-        edges, place, *known = _full(size, is_batched, args)
-        if is_batched[0]:
-            return jax.vmap(rounds)(edges, place, *known), True
-        # The place changes no result: that of the first copy is as good as any.
-        return _many(rounds, sweeps)(edges[0], place[0], *known), True
+        args = _full(size, is_batched, args)
+        if any(is_batched[:num_tables]):
+            return jax.vmap(rounds)(*args), True
+        tables = [x[0] for x in args[:num_tables]]
+        return _many(rounds, sweeps, num_tables)(*tables, *args[num_tables:]), True
 
     return one
 
 
 @functools.cache
-def _many(rounds: Kernel, sweeps: Kernel) -> Kernel:
-    """Return the search of many copies of one graph."""
+def _many(rounds: Kernel, sweeps: Kernel, num_tables: int) -> Kernel:
+    """Return the function of many states of one asset."""
 
     @jax.custom_batching.custom_vmap
-    def many(edges: jax.Array, place: jax.Array, *known: jax.Array) -> jax.Array:
-        def each(edges: jax.Array, place: jax.Array, *known: jax.Array) -> jax.Array:
-            return jax.vmap(lambda *x: rounds(edges, place, *x))(*known)
+    def many(*args: jax.Array) -> jax.Array:
+        def each(*args: jax.Array) -> jax.Array:
+            tables, states = args[:num_tables], args[num_tables:]
+            return jax.vmap(functools.partial(rounds, *tables))(*states)
 
         # A sweep is one long chain of small steps, the wrong thing for an accelerator,
         # and for a handful of copies.
-        if known[0].shape[0] < FEW:
-            return each(edges, place, *known)
-        return jax.lax.platform_dependent(
-            edges, place, *known, cpu=sweeps, default=each
-        )
+        if args[num_tables].shape[0] < FEW:
+            return each(*args)
+        return jax.lax.platform_dependent(*args, cpu=sweeps, default=each)
 
     @many.def_vmap
     def batched(
         size: int, is_batched: Sequence[bool], *args: jax.Array
     ) -> tuple[jax.Array, bool]:
-        edges, place, *known = _full(size, is_batched, args)
-        if is_batched[0]:
-            # Different graphs: together if each has one copy, else one by one.
-            if known[0].shape[1] == 1:
-                only = jax.vmap(rounds)(edges, place, *[x[:, 0] for x in known])
+        args = _full(size, is_batched, args)
+        tables, states = args[:num_tables], args[num_tables:]
+        if any(is_batched[:num_tables]):
+            # Different assets: together if each has one state, else one by one.
+            if states[0].shape[1] == 1:
+                only = jax.vmap(rounds)(*tables, *[x[:, 0] for x in states])
                 return only[:, None], True
-            return jax.lax.map(lambda x: many(*x), (edges, place, *known)), True
-        copies = [x.reshape(-1, *x.shape[2:]) for x in known]
-        found = many(edges[0], place[0], *copies)
-        return found.reshape(*known[0].shape[:2], -1), True
+            return jax.lax.map(lambda x: many(*x), args), True
+        copies = [x.reshape(-1, *x.shape[2:]) for x in states]
+        found = many(*[x[0] for x in tables], *copies)
+        return found.reshape(*states[0].shape[:2], -1), True
 
     return many
 
 
 def _full(
     size: int, is_batched: Sequence[bool], args: Sequence[jax.Array]
-) -> list[jax.Array]:
-    return [
+) -> tuple[jax.Array, ...]:
+    return tuple(
         x if b else jnp.broadcast_to(x, (size, *x.shape))
         for x, b in zip(args, is_batched, strict=True)
-    ]
+    )
 
 
 def shortest_ways(
@@ -216,7 +241,7 @@ def bottleneck(
     strength = jnp.where(strength > lowest, strength, lowest)
     if place is None:
         place = jnp.arange(num_nodes, dtype=jnp.int32)
-    search = _one(_boruvka, lanes.bottlenecks_in_tiles)
+    search = _one(_boruvka, lanes.bottlenecks_in_tiles, 2)
     cost = lanes.to_rank(-strength)
     edge = search(edges, jax.lax.stop_gradient(place), cost, source)
     # Sources and what infinite weights lead to have one past the last edge.
@@ -304,6 +329,22 @@ def _ends(pointer: jax.Array) -> jax.Array:
     return jax.lax.while_loop(lambda c: c[1], jump, start)[0]
 
 
+def running_count(flags: jax.Array) -> jax.Array:
+    """Count the flags (n,) up to each, itself included: (n,) integers.
+
+    Piecewise constant: no derivative passes.
+    """
+    n = flags.shape[0]
+    count = flags.astype(jnp.int16 if n <= jnp.iinfo(jnp.int16).max else jnp.int32)
+    # By doubling: few passes over all, where a scan would go entry by entry.
+    step = 1
+    while step < n:
+        before = jnp.pad(count[:-step], (step, 0))
+        count = jax.lax.optimization_barrier(count + before)
+        step *= 2
+    return count
+
+
 def group_sum(values: jax.Array, group: jax.Array, num_groups: int) -> jax.Array:
     """Sum rows of values (n, ...) by their group (n,) into (num_groups, ...).
 
@@ -320,5 +361,40 @@ def group_any(flags: jax.Array, group: jax.Array, num_groups: int) -> jax.Array:
 
     Piecewise constant: no derivative passes.
     """
-    group = jnp.where(group < 0, num_groups, group)
-    return jnp.zeros(num_groups, bool).at[group].max(flags, mode="drop")
+    return _scattered(num_groups, bool)(flags, group)
+
+
+def group_count(group: jax.Array, num_groups: int) -> jax.Array:
+    """Return how many entries (n,) name each group, (num_groups,) int32."""
+    return _scattered(num_groups, int)(jnp.ones(group.shape, bool), group)
+
+
+@functools.cache
+def _scattered(num_groups: int, kind: type) -> Kernel:
+    """Return the scatter of flags (n,) to groups (n,): any of them, or how many."""
+
+    def one(flags: jax.Array, group: jax.Array) -> jax.Array:
+        # Negative numbers would count from the end; out of range, they are dropped.
+        group = jnp.where(flags & (group >= 0), group, num_groups)
+        if kind is bool:
+            return jnp.zeros(num_groups, bool).at[group].set(True, mode="drop")
+        return jnp.zeros(num_groups, jnp.int32).at[group].add(1, mode="drop")
+
+    scatter = jax.custom_batching.custom_vmap(one)
+
+    @scatter.def_vmap
+    def batched(
+        size: int, is_batched: Sequence[bool], *args: jax.Array
+    ) -> tuple[jax.Array, bool]:
+        flags, group = _full(size, is_batched, args)
+        if size * num_groups > jnp.iinfo(jnp.int32).max:
+            return jax.vmap(one)(flags, group), True
+        # One scatter of all, several times faster than a batch of them.
+        copy = jnp.arange(size, dtype=jnp.int32)[:, None]
+        within = (group >= 0) & (group < num_groups)
+        group = jnp.where(within, copy * num_groups + group, -1)
+        of_all = _scattered(size * num_groups, kind)
+        found = of_all(flags.reshape(-1), group.reshape(-1))
+        return found.reshape(size, num_groups), True
+
+    return scatter

@@ -19,37 +19,49 @@ import numpy as np
 from jax import lax
 
 LANES = 128
-"""Copies in a tile: its labels and bonds fit a core's second cache at 512 nodes."""
+"""Copies in a tile: labels that are read again soon stay in a core's first cache."""
 LIMIT = 65535
 """Nodes from which labels no longer fit 16 bits."""
-PATIENCE = 6
-"""Pairs of sweeps before a tile also jumps: few tiles need it, and it costs a pair."""
+PATIENCE = 16
+"""Pairs of sweeps before a tile also jumps, now and then: most tiles never need it."""
 DEGREES = (0, 1, 2, 3, 4, 6, 8, 12, 16)
-"""A node's neighbours on one side are read in one step of the next such size."""
-ROWS = 8
-"""Rows of labels summed at a time."""
+"""Nodes' neighbours on one side are read in one step of the next such size."""
+GROUP = 4
+"""Nodes that a sweep visits at a time: a step of a loop costs as much as some rows."""
+BLOCK = 32
+"""Copies that are turned into lanes at a time; they divide those in a tile."""
+SURE = 3
+"""Sweeps before it is worth a look whether anything still changes."""
 
 
 class Order(NamedTuple):
-    """What every turn of a sweep reads, forward (0) and backward (1).
+    """The way through a graph. Rows are the nodes in the order of their visits.
 
-    A node's neighbours are those that the sweep has visited before it.
+    Rows are visited in groups of neighbours in that order, none of which is joined to
+    another of its group. A row's neighbours are those before it, for the sweep forward
+    (0), and those behind it, for the sweep backward (1).
     """
 
     visit: jax.Array
-    """(2, N,) node by turn."""
+    """(N,) node by row."""
+    turn: jax.Array
+    """(N,) row by node."""
+    groups: jax.Array
+    """() how many there are."""
+    first: jax.Array
+    """(N,) by group, its first row."""
     kind: jax.Array
-    """(2, N,) by turn, index into DEGREES; one beyond its end for hubs."""
+    """(2, N,) by group, index into DEGREES; one beyond its end for hubs."""
     near: jax.Array
-    """(2, N, K) by turn, the first neighbours; the node itself where there are less."""
+    """(2, N + GROUP, K) by row, the first neighbours; itself where there are less."""
     by: jax.Array
-    """(2, N, K) by turn, the edges to them; B where there are less."""
+    """(2, N + GROUP, K) by row, the edges to them; any where there are less."""
     start: jax.Array
-    """(2, N,) by turn, where its neighbours begin in `node`."""
+    """(2, N + GROUP,) by row, where its neighbours begin in `node`."""
     degree: jax.Array
-    """(2, N,) by turn, how many it has."""
+    """(2, N + GROUP,) by row, how many it has."""
     node: jax.Array
-    """(2, B,) all neighbours, one node's after the other's."""
+    """(2, B,) all neighbours, one row's after the other's."""
     edge: jax.Array
     """(2, B,) the edges to them."""
 
@@ -72,65 +84,115 @@ def order(edges: jax.Array, num_nodes: int, place: jax.Array | None = None) -> O
     if place is not None:
         visit = jnp.argsort(place).astype(jnp.int32)
         turn = jnp.zeros_like(nodes).at[visit].set(nodes, unique_indices=True)
-    a, b = edges[:, 0], edges[:, 1]
-    swap = turn[a] > turn[b]
-    early, late = jnp.where(swap, b, a), jnp.where(swap, a, b)
-    ways = _way(late, early, visit), _way(early, late, visit[::-1])
-    return jax.tree.map(lambda *x: jnp.stack(x), *ways)
+    a, b = turn[edges[:, 0]], turn[edges[:, 1]]
+    early, late = jnp.minimum(a, b), jnp.maximum(a, b)
+    ways = _side(late, early, nodes), _side(early, late, nodes)
+    near, by, start, degree, node, edge = map(jnp.stack, zip(*ways, strict=True))
+    # Level by level nothing else comes before its turn, but more goes into a group.
+    level = _levels(near[0, :num_nodes])
+    busy = jnp.minimum(jnp.sum(degree[:, :num_nodes], axis=0), 63)
+    rows = jnp.argsort(64 * level + busy).astype(jnp.int32)
+    to = nodes.at[rows].set(nodes, unique_indices=True)
+    tail = jnp.arange(GROUP, dtype=jnp.int32) + num_nodes
+    rows, beyond = jnp.concatenate([rows, tail]), jnp.concatenate([to, tail])
+    visit, near, node = visit[rows[:num_nodes]], beyond[near[:, rows]], to[node]
+    turn, by, start, degree = to[turn], by[:, rows], start[:, rows], degree[:, rows]
+    early, late = to[early], to[late]
+    # A pair of a node with itself is padding.
+    before = jnp.where(early < late, early, -1)
+    last = jnp.full_like(nodes, -1).at[late].max(before)
+    group = _groups(last)
+    most = jnp.zeros((2, num_nodes), jnp.int32).at[:, group].max(degree[:, :num_nodes])
+    steps = jnp.asarray(DEGREES, jnp.int32)
+    kind = jnp.sum(most[..., None] > steps[None, None], axis=-1, dtype=jnp.int32)
+    first = jnp.full_like(nodes, num_nodes).at[group].min(nodes)
+    # Unsigned, an index is not checked for counting from the end.
+    first, near, by, start, degree, node, edge = (
+        x.astype(jnp.uint32) for x in (first, near, by, start, degree, node, edge)
+    )
+    groups = group[-1] + 1
+    return Order(visit, turn, groups, first, kind, near, by, start, degree, node, edge)
 
 
-def _way(here: jax.Array, there: jax.Array, visit: jax.Array) -> Order:
+def _levels(near: jax.Array) -> jax.Array:
+    """Return how long a chain of neighbours (N, K) before it each row ends, (N,)."""
+
+    def one(row: jax.Array, level: jax.Array) -> jax.Array:
+        before = lax.dynamic_index_in_dim(near, row, keepdims=False)
+        top = jnp.max(jnp.where(before == row, -1, level[before])) + 1
+        return lax.dynamic_update_index_in_dim(level, top, row, 0)
+
+    start = jnp.zeros(near.shape[0], jnp.int32)
+    return lax.fori_loop(0, near.shape[0], one, start)
+
+
+def _groups(last: jax.Array) -> jax.Array:
+    """Return the group of each row, by its last neighbour before it; (N,) each."""
+
+    def walk(
+        first: jax.Array, x: tuple[jax.Array, jax.Array]
+    ) -> tuple[jax.Array, jax.Array]:
+        row, last = x
+        begins = (last >= first) | (row - first == GROUP)
+        return jnp.where(begins, row, first), begins
+
+    rows = jnp.arange(last.shape[0], dtype=jnp.int32)
+    _, begins = lax.scan(walk, jnp.int32(0), (rows, last))
+    return jnp.cumsum(begins, dtype=jnp.int32)
+
+
+def _side(here: jax.Array, there: jax.Array, rows: jax.Array) -> tuple[jax.Array, ...]:
+    """Return near, by, start, degree, node and edge of `Order`, of one side."""
     num_edges = here.shape[0]
     edge = jnp.arange(num_edges, dtype=jnp.int32)
-    _, edge = lax.sort_key_val(here, edge)
+    # By row, and which edge of a row comes first does not matter.
+    _, edge = lax.sort((here, edge), num_keys=1, is_stable=False)
     node = there[edge]
-    count = jnp.zeros_like(visit).at[here].add(1)
-    start = (jnp.cumsum(count, dtype=jnp.int32) - count)[visit]
-    count = count[visit]
-    steps = jnp.asarray(DEGREES, jnp.int32)
-    kind = jnp.sum(count[:, None] > steps[None], axis=1, dtype=jnp.int32)
+    count = jnp.zeros_like(rows).at[here].add(1)
+    start = jnp.cumsum(count, dtype=jnp.int32) - count
     slot = jnp.arange(DEGREES[-1], dtype=jnp.int32)[None]
     there_is = slot < count[:, None]
     entry = jnp.minimum(start[:, None] + slot, num_edges - 1)
-    near = jnp.where(there_is, node[entry], visit[:, None])
-    by = jnp.where(there_is, edge[entry], num_edges)
-    return Order(visit, kind, near, by, start, count, node, edge)
+    near = jnp.where(there_is, node[entry], rows[:, None])
+    # The last group reads some rows more, and nothing comes of them.
+    tail = jnp.arange(GROUP, dtype=jnp.int32) + rows.shape[0]
+    near = jnp.concatenate(
+        [near, jnp.broadcast_to(tail[:, None], (GROUP, DEGREES[-1]))]
+    )
+    by, start, count = (
+        jnp.pad(x, [(0, GROUP), *[(0, 0)] * (x.ndim - 1)])
+        for x in (edge[entry], start, count)
+    )
+    return near, by, start, count, node, edge
 
 
-def islands(way: Order, dead: jax.Array) -> jax.Array:
+def islands(way: Order, alive: jax.Array) -> jax.Array:
     """Label the nodes of every copy with the smallest node that they reach.
 
     Args:
       way: the way through the graph, of N nodes and B edges.
-      dead: (B + 1, T) of the label's dtype: 0 where an edge connects, all ones where it
-        does not; the last row is all ones.
+      alive: (B, T) bool, where an edge connects.
 
     Returns:
       (N, T) labels.
     """
-    num_nodes, lanes = way.visit.shape[1], dead.shape[1]
-    rows = -(-num_nodes // ROWS) * ROWS
-    labels = lax.broadcasted_iota(dead.dtype, (rows, lanes), 0)
+    num_nodes, num_copies = way.visit.shape[0], alive.shape[1]
+    dtype = label_dtype(num_nodes)
+    none = jnp.array(np.iinfo(dtype).max, dtype)
+    names = jnp.pad(way.visit, (0, GROUP)).astype(dtype)
+    labels = jnp.broadcast_to(names[:, None], (num_nodes + GROUP, num_copies))
 
     def offer(
-        labels: jax.Array, here: jax.Array, node: jax.Array, edge: jax.Array
+        labels: jax.Array, here: jax.Array, near: jax.Array, by: jax.Array
     ) -> jax.Array:
         del here
-        return _row(labels, node) | _row(dead, edge)
+        return jnp.where(_rows(alive, by), _rows(labels, near), none)
 
-    def half(
-        carry: tuple[jax.Array, jax.Array, jax.Array, jax.Array],
-    ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-        labels, total, count, _ = carry
-        jumps = (count >= 2 * PATIENCE) & (count % 2 == 0)
-        labels = lax.cond(jumps, _jump, lambda x: x, labels)
-        labels = _sweep(labels, way, count % 2, offer)
-        now = _total(labels)
-        # A sweep without a change is the end, for the one before went the other way.
-        return labels, now, count + 1, (count == 0) | jnp.any(now != total)
+    def ease(labels: jax.Array, count: jax.Array) -> jax.Array:
+        jumps = (count >= 2 * PATIENCE) & (count % 8 == 0)
+        return lax.cond(jumps, lambda x: _jump(x, way), lambda x: x, labels)
 
-    start = labels, _total(labels), jnp.int32(0), jnp.array(True)
-    return lax.while_loop(lambda c: c[3], half, start)[0][:num_nodes]
+    return _rows(_settle(labels, way, offer, ease), way.turn)
 
 
 def _sweep(
@@ -139,90 +201,76 @@ def _sweep(
     side: jax.Array,
     offer: Callable[[jax.Array, jax.Array, jax.Array, jax.Array], jax.Array],
 ) -> jax.Array:
-    """Lower each node's row to the least of offer(rows, node, neighbour, edge)."""
+    """Lower rows, group by group, to the least of what their neighbours offer.
+
+    Args:
+      rows: (N + GROUP or more, T).
+      way: the way through the graph.
+      side: () 0 forward, 1 backward.
+      offer: of rows, the first row of a group, a neighbour of each of its rows (n,), or
+        the row itself, and the edges to them (n,): (n, T).
+    """
+    zero = jnp.uint32(0)
+    side = side.astype(jnp.uint32)
 
     def of_degree(degree: int) -> Callable[[jax.Array, jax.Array], jax.Array]:
-        def relax(rows: jax.Array, i: jax.Array) -> jax.Array:
-            here = way.visit[side, i]
-            low = _row(rows, here)
+        def relax(rows: jax.Array, first: jax.Array) -> jax.Array:
+            low = _group(rows, first)
+            if degree == 0:
+                return low
+            at, size = (side, first, zero), (1, GROUP, degree)
+            near = lax.dynamic_slice(way.near, at, size)[0]
+            by = lax.dynamic_slice(way.by, at, size)[0]
             for j in range(degree):
-                node, edge = way.near[side, i, j], way.by[side, i, j]
-                low = jnp.minimum(low, offer(rows, here, node, edge))
+                low = jnp.minimum(low, offer(rows, first, near[:, j], by[:, j]))
             return low
 
         return relax
 
-    def hub(rows: jax.Array, i: jax.Array) -> jax.Array:
-        here = way.visit[side, i]
+    def hub(rows: jax.Array, first: jax.Array) -> jax.Array:
+        at, size = (side, first), (1, GROUP)
+        start = lax.dynamic_slice(way.start, at, size)[0]
+        degree = lax.dynamic_slice(way.degree, at, size)[0]
+        own = first + jnp.arange(GROUP, dtype=jnp.uint32)
+        last = jnp.uint32(way.node.shape[1] - 1)
 
         def one(j: jax.Array, low: jax.Array) -> jax.Array:
-            j = way.start[side, i] + j
-            node, edge = way.node[side, j], way.edge[side, j]
-            return jnp.minimum(low, offer(rows, here, node, edge))
+            there_is = j < degree
+            entry = jnp.minimum(start + j, last)
+            near = jnp.where(there_is, way.node[side][entry], own)
+            by = way.edge[side][entry]
+            return jnp.minimum(low, offer(rows, first, near, by))
 
-        return lax.fori_loop(0, way.degree[side, i], one, _row(rows, here))
+        return lax.fori_loop(zero, jnp.max(degree), one, _group(rows, first))
 
     branches = [*map(of_degree, DEGREES), hub]
 
-    def turn(i: jax.Array, rows: jax.Array) -> jax.Array:
-        low = lax.switch(way.kind[side, i], branches, rows, i)
-        # Without the barrier XLA computes the row anew wherever it is read.
+    def visit(i: jax.Array, rows: jax.Array) -> jax.Array:
+        i = jnp.where(side == 0, i, way.groups - 1 - i)
+        first = way.first[i]
+        low = lax.switch(way.kind[side, i], branches, rows, first)
+        # Without the barrier XLA computes the rows anew wherever they are read.
         low = lax.optimization_barrier(low)
-        here = way.visit[side, i], jnp.int32(0)
-        return lax.dynamic_update_slice(rows, low, here)
+        return lax.dynamic_update_slice(rows, low, (first, zero))
 
-    return lax.fori_loop(0, way.visit.shape[1], turn, rows)
-
-
-def _row(x: jax.Array, i: jax.Array) -> jax.Array:
-    return x.at[i].get(mode="promise_in_bounds")[None]
+    return lax.fori_loop(0, way.groups, visit, rows)
 
 
-def _total(labels: jax.Array) -> jax.Array:
-    """Sum up each column; below 2^32, so it falls whenever a label falls."""
-    rows, lanes = labels.shape
-
-    def add(i: jax.Array, total: jax.Array) -> jax.Array:
-        slab = lax.dynamic_slice(labels, (i * ROWS, jnp.int32(0)), (ROWS, lanes))
-        return total + slab.astype(jnp.uint32)
-
-    start = jnp.zeros((ROWS, lanes), jnp.uint32)
-    return lax.fori_loop(0, rows // ROWS, add, start).sum(axis=0)
+def _rows(x: jax.Array, i: jax.Array) -> jax.Array:
+    """Return rows i (n,) of x."""
+    dims = lax.GatherDimensionNumbers((1,), (0,), (0,))
+    sizes = (1, x.shape[1])
+    return lax.gather(x, i[:, None], dims, sizes, mode="promise_in_bounds")
 
 
-def _jump(labels: jax.Array) -> jax.Array:
-    index = labels.astype(jnp.int32)
+def _group(x: jax.Array, first: jax.Array) -> jax.Array:
+    return lax.dynamic_slice(x, (first, jnp.uint32(0)), (GROUP, x.shape[1]))
+
+
+def _jump(labels: jax.Array, way: Order) -> jax.Array:
+    """Take the label of the node that each is labelled with."""
+    index = way.turn[labels.astype(jnp.int32)]
     return jnp.take_along_axis(labels, index, axis=0, mode="promise_in_bounds")
-
-
-def to_dead(alive: jax.Array, dtype: type[np.unsignedinteger]) -> jax.Array:
-    """Turn the edges of copies (T, B) bool into (B + 1, T) for `islands`."""
-    lanes, num_edges = alive.shape
-    words = -(-num_edges // 4)
-    alive = jnp.pad(alive, ((0, 0), (0, 4 * words - num_edges)))
-    # Four flags move as one word: a transpose costs by the element.
-    packed = alive.astype(jnp.uint8).reshape(lanes, words, 4)
-    word = lax.optimization_barrier(lax.bitcast_convert_type(packed, jnp.uint32).T)
-    shift = jnp.arange(4, dtype=jnp.uint32)[None, :, None] * jnp.uint32(8)
-    flag = (word[:, None, :] >> shift).astype(dtype) & dtype(1)
-    dead = (flag - dtype(1)).reshape(4 * words, lanes)[:num_edges]
-    none = jnp.full((1, lanes), np.iinfo(dtype).max, dtype)
-    return jnp.concatenate([dead, none])
-
-
-def from_labels(labels: jax.Array) -> jax.Array:
-    """Turn labels (N, T) into (T, N) int32."""
-    num_nodes, lanes = labels.shape
-    each = 4 // labels.dtype.itemsize
-    words = -(-num_nodes // each)
-    labels = jnp.pad(labels, ((0, each * words - num_nodes), (0, 0)))
-    parts = labels.reshape(words, each, lanes).astype(jnp.uint32)
-    word = parts[:, 0]
-    for i in range(1, each):
-        word = word | (parts[:, i] << jnp.uint32(8 * labels.dtype.itemsize * i))
-    word = lax.optimization_barrier(word).T
-    flat = lax.bitcast_convert_type(lax.optimization_barrier(word), labels.dtype)
-    return flat.reshape(lanes, -1)[:, :num_nodes].astype(jnp.int32)
 
 
 def bottlenecks(
@@ -235,8 +283,7 @@ def bottlenecks(
     Args:
       way: the way through the graph, of N nodes and B edges.
       edges: (B, 2) nodes.
-      cost: (B + 1, T) signed integers; the last is the greatest there is, no other is
-        that or the least.
+      cost: (B, T) signed integers, none of them the greatest or least there is.
       source: (N, T) bool.
 
     Returns:
@@ -246,65 +293,86 @@ def bottlenecks(
     limits = jnp.iinfo(cost.dtype)
 
     def dearest(
-        level: jax.Array, here: jax.Array, node: jax.Array, edge: jax.Array
+        level: jax.Array, here: jax.Array, near: jax.Array, by: jax.Array
     ) -> jax.Array:
         del here
-        return jnp.maximum(_row(level, node), _row(cost, edge))
+        return jnp.maximum(_rows(level, near), _rows(cost, by))
 
+    source = jnp.pad(_rows(source, way.visit), ((0, GROUP), (0, 0)))
     start = jnp.where(source, limits.min, limits.max).astype(cost.dtype)
     level = _settle(start, way, dearest)
-    dtype = np.uint16 if cost.shape[0] < LIMIT else np.uint32
+    dtype = np.uint16 if cost.shape[0] + 1 < LIMIT else np.uint32
     none = dtype(np.iinfo(dtype).max)
 
     def leave(
-        name: jax.Array, here: jax.Array, node: jax.Array, edge: jax.Array
+        name: jax.Array, here: jax.Array, near: jax.Array, by: jax.Array
     ) -> jax.Array:
         # The dear edge is the one by which the way leaves the nodes of its level.
         del name
-        near, far = _row(level, here), _row(level, node)
-        leaves = jnp.maximum(far, _row(cost, edge)) == near
-        return jnp.where(leaves & (far < near), edge.astype(dtype), none)
+        own, far = _group(level, here), _rows(level, near)
+        leaves = jnp.maximum(far, _rows(cost, by)) == own
+        return jnp.where(leaves & (far < own), by.astype(dtype)[:, None], none)
 
     # All nodes that it can be reached from on their level share its name.
-    a, b = level[edges[:, 0]], level[edges[:, 1]]
-    apart = jnp.where((a == b) & (cost[:-1] <= a), dtype(0), none)
-    apart = jnp.concatenate([apart, jnp.full((1, cost.shape[1]), none)])
+    a, b = _rows(level, way.turn[edges[:, 0]]), _rows(level, way.turn[edges[:, 1]])
+    apart = jnp.where((a == b) & (cost <= a), dtype(0), none)
 
     def share(
-        name: jax.Array, here: jax.Array, node: jax.Array, edge: jax.Array
+        name: jax.Array, here: jax.Array, near: jax.Array, by: jax.Array
     ) -> jax.Array:
         del here
-        return _row(name, node) | _row(apart, edge)
+        return _rows(name, near) | _rows(apart, by)
 
     name = jnp.where(source, dtype(edges.shape[0]), none)
     for side in (0, 1):
         name = _sweep(name, way, jnp.int32(side), leave)
-    return _settle(name, way, share)
+    return _rows(_settle(name, way, share), way.turn)
 
 
 def _settle(
     rows: jax.Array,
     way: Order,
     offer: Callable[[jax.Array, jax.Array, jax.Array, jax.Array], jax.Array],
+    ease: Callable[[jax.Array, jax.Array], jax.Array] = lambda rows, count: rows,
 ) -> jax.Array:
-    """Sweep to and fro until nothing changes."""
+    """Sweep to and fro until nothing changes.
+
+    Args:
+      rows: see `_sweep`.
+      way: see `_sweep`.
+      offer: see `_sweep`.
+      ease: what may be done to the rows before a sweep, by the number of the sweep.
+    """
 
     def half(
-        carry: tuple[jax.Array, jax.Array, jax.Array],
-    ) -> tuple[jax.Array, jax.Array, jax.Array]:
-        rows, count, _ = carry
-        new = _sweep(rows, way, count % 2, offer)
-        return new, count + 1, (count == 0) | jnp.any(new != rows)
+        carry: tuple[jax.Array, jax.Array, jax.Array, jax.Array],
+    ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+        rows, total, count, _ = carry
+        rows = _sweep(ease(rows, count), way, count % 2, offer)
+        now = lax.cond(count < SURE - 1, lambda x: total, _total, rows)
+        # A sweep without a change is the end, for the one before went the other way.
+        return rows, now, count + 1, (count < SURE) | jnp.any(now != total)
 
-    start = rows, jnp.int32(0), jnp.array(True)
-    return lax.while_loop(lambda c: c[2], half, start)[0]
+    total = jnp.zeros(rows.shape[1], jnp.uint32)
+    start = rows, total, jnp.int32(0), jnp.array(True)
+    return lax.while_loop(lambda c: c[3], half, start)[0]
+
+
+def _total(rows: jax.Array) -> jax.Array:
+    """Sum up each column; of labels below 2^32, so it falls whenever a label falls."""
+
+    def add(i: jax.Array, total: jax.Array) -> jax.Array:
+        return total + _group(rows, i * GROUP).astype(jnp.uint32)
+
+    start = jnp.zeros((GROUP, rows.shape[1]), jnp.uint32)
+    count = jnp.uint32(rows.shape[0] // GROUP)
+    return lax.fori_loop(jnp.uint32(0), count, add, start).sum(axis=0)
 
 
 def in_tiles(edges: jax.Array, place: jax.Array, alive: jax.Array) -> jax.Array:
     """Label the nodes of copies (T, B) of one graph: (T, N) int32."""
-    num_nodes = place.shape[0]
-    dtype, way = label_dtype(num_nodes), order(edges, num_nodes, place)
-    return _tiled(lambda x: from_labels(islands(way, to_dead(x, dtype))), alive)
+    way = order(edges, place.shape[0], place)
+    return tiled(lambda x: islands(way, x), jnp.int32, alive)
 
 
 def bottlenecks_in_tiles(
@@ -321,22 +389,26 @@ def bottlenecks_in_tiles(
     Returns:
       (T, N) int32 edges; B at sources, -1 where no way leads.
     """
-    num_edges, num_nodes = edges.shape[0], place.shape[0]
-    way = order(edges, num_nodes, place)
-
-    def tile(cost: jax.Array, source: jax.Array) -> jax.Array:
-        none = jnp.full((1, cost.shape[0]), jnp.iinfo(cost.dtype).max, cost.dtype)
-        cost = jnp.concatenate([lax.optimization_barrier(cost.T), none])
-        edge = from_labels(bottlenecks(way, edges, cost, source.T))
-        return jnp.where(edge > num_edges, -1, edge)
-
-    return _tiled(tile, cost, source)
+    way = order(edges, place.shape[0], place)
+    edge = tiled(lambda *x: bottlenecks(way, edges, *x), jnp.int32, cost, source)
+    return jnp.where(edge > edges.shape[0], -1, edge)
 
 
-def _tiled(tile: Callable[..., jax.Array], *copies: jax.Array) -> jax.Array:
-    """Call tile on so many copies (T, ...) at a time, and join what it returns."""
+def tiled(
+    tile: Callable[..., jax.Array], dtype: jax.typing.DTypeLike, *copies: jax.Array
+) -> jax.Array:
+    """Call a function of lanes on some copies at a time.
+
+    Args:
+      tile: of arrays (n, lanes), as many as `copies`: (m, lanes).
+      dtype: of the result.
+      copies: arrays (T, n).
+
+    Returns:
+      (T, m).
+    """
     size = copies[0].shape[0]
-    width = min(LANES, -(-size // 32) * 32)
+    width = min(LANES, -(-size // BLOCK) * BLOCK)
     tiles = -(-size // width)
 
     def split(x: jax.Array) -> jax.Array:
@@ -344,8 +416,18 @@ def _tiled(tile: Callable[..., jax.Array], *copies: jax.Array) -> jax.Array:
         return x.reshape(tiles, width, -1)
 
     # Not a vmap: every tile stops when it is done.
-    found = lax.map(lambda x: tile(*x), tuple(map(split, copies)))
-    return found.reshape(tiles * width, -1)[:size]
+    found = lax.map(lambda x: tile(*map(_to_lanes, x)), tuple(map(split, copies)))
+    found = found.swapaxes(1, 2).astype(dtype).reshape(tiles * width, -1)[:size]
+    # Or everything that reads it would turn it anew.
+    return lax.optimization_barrier(found)
+
+
+def _to_lanes(x: jax.Array) -> jax.Array:
+    """Turn copies (T, n) into lanes (n, T)."""
+    # By blocks: more rows at once would lie on more pages than a core keeps at hand.
+    # Behind barriers: fused with what makes or reads it, a transpose is slow.
+    blocks = lax.optimization_barrier(jnp.split(x, x.shape[0] // BLOCK))
+    return lax.optimization_barrier(jnp.concatenate([b.T for b in blocks], axis=1))
 
 
 def to_rank(x: jax.Array) -> jax.Array:

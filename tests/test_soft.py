@@ -10,6 +10,7 @@ import pytest
 from blastjax import author, chunks, fracture, graph, soft
 from blastjax.author import shapes
 from blastjax.core import UNBREAKABLE, Damage
+from blastjax.soft import chance
 
 pytestmark = pytest.mark.usefixtures("strict")
 
@@ -277,6 +278,26 @@ def test_expectation_is_that_of_all_outcomes(small, name):
         # The errors are of the size that they claim to be.
         size = jnp.linalg.norm(truth[1]["health"])
         assert float(jnp.linalg.norm(found.gradient_error["health"]) / size) < 0.2
+
+
+@pytest.mark.parametrize("samples", (5, 12))
+def test_fit_of_each_sample_leaves_it_out(samples):
+    rng = np.random.default_rng(samples)
+    p = rng.uniform(0.1, 0.9, 8)
+    alive = rng.random((samples, 8)) < p
+    value, variance = rng.normal(3.0, 1.0, samples), p * (1 - p)
+    # More samples than bonds, and fewer: the two ways to solve it.
+    left, slope = chance._leave_one_out(
+        jnp.asarray(alive - p), jnp.asarray(value), jnp.asarray(variance)
+    )
+    ridge = np.zeros((9, 9))
+    np.fill_diagonal(ridge[1:, 1:], variance.sum() / 2)
+    rows = np.concatenate([np.ones((samples, 1)), alive - p], axis=1)
+    for i in range(samples):
+        others = np.delete(rows, i, axis=0)
+        fit = np.linalg.solve(others.T @ others + ridge, others.T @ np.delete(value, i))
+        np.testing.assert_allclose(left[i], value[i] - rows[i] @ fit, rtol=2e-5)
+        np.testing.assert_allclose(slope[i], fit[1:], rtol=2e-4, atol=2e-6)
 
 
 def test_expectation_leaves_certain_bonds_alone(small):

@@ -312,7 +312,7 @@ def draw(rows, path):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--repeats", type=int, default=32)
+    parser.add_argument("--repeats", type=int, default=128)
     parser.add_argument("--batches", type=int, default=64)
     parser.add_argument("--small", action="store_true", help="the 5 x 4 wall only")
     parser.add_argument("--seed", type=int, default=0)
