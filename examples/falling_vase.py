@@ -25,7 +25,7 @@ FLOOR = """
 """
 
 
-def main(path: str | None = None, shards: int = 24, seconds: float = 2.4) -> None:
+def main(path: str | None = None, shards: int = 24, seconds: float = 3.0) -> None:
     """Drop a vase on its rim and write an animation, if a path is given."""
     # A solid of revolution, in Voronoi cells; bonds are where cells touch.
     vase = trimesh.creation.revolve(np.array(OUTER + INNER), sections=32)

@@ -415,10 +415,10 @@ def test_pieces_come_to_rest_and_neither_sink_nor_jitter(dtype):
 @pytest.mark.slow
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_leaning_shards_of_a_vase_come_to_rest(dtype):
-    from tests.benchmarks.hulls import falls
+    from tests.benchmarks.hulls import DROPS, falls
 
     with jax.enable_x64(dtype == "float64"):
-        found = falls("vase", 12, 1, (0.2, 0.3, 0.45), resting=Resting())
+        found = falls("vase", 12, 1, DROPS, resting=Resting())
     for row in found:
         assert row["actors"] == 12
         assert row["speed"] < 1e-6
