@@ -160,7 +160,7 @@ def _owner(
     direct = _take(actor, element, NONE)
     # In depth-first order a subtree is a range: it has one owner if no neighbours in
     # the range differ, which a running count of differences tells.
-    label = actor[node]
+    label = jax.lax.optimization_barrier(actor[node])
     differs = jnp.concatenate([jnp.zeros(1, bool), label[1:] != label[:-1]])
     count = graph.running_count(differs)
     first = span[:, 0]
@@ -178,7 +178,8 @@ def _visible(
     actor: jax.Array,
 ) -> jax.Array:
     """Return which chunks are visible, by the elements' actors (A,)."""
-    owner = _owner(element, span, node, actor)
+    # Behind a barrier, or XLA computes the owner anew for each chunk that asks for it.
+    owner = jax.lax.optimization_barrier(_owner(element, span, node, actor))
     return (owner != NONE) & (_take(owner, parent, NONE) != owner)
 
 

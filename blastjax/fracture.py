@@ -234,8 +234,8 @@ def _apply_to_bonds(
 def _dirty(asset: Asset, state: State, removed: jax.Array) -> jax.Array:
     if removed.shape[0] == 0:
         return state.dirty
-    first, second = asset.bond_nodes[:, 0], asset.bond_nodes[:, 1]
-    return state.dirty.at[first].max(removed).at[second].max(removed)
+    ends, both = asset.bond_nodes.T.reshape(-1), jnp.concatenate([removed, removed])
+    return state.dirty | graph.group_any(both, ends, state.dirty.shape[0])
 
 
 def apply_buffer(

@@ -44,30 +44,26 @@ def blasts(batch, rng):
     return place.astype(np.float32), rng.uniform(0.1, 0.6, batch).astype(np.float32)
 
 
-def round_trip(asset, whole):
-    """Return the step of one body: (point, radius) -> state, visible, events."""
-
-    def step(point, radius):
-        hit = damage.falloff(asset, whole, point, 2.0, radius, radius)
-        state, events = fracture.step(asset, whole, hit)
-        return state, chunks.visible(asset, state), events
-
-    return step
+def generate(asset, point, radius):
+    """Reset one body; return its state and the damage of a blast to it."""
+    whole = fracture.init(asset)
+    return whole, damage.falloff(asset, whole, point, 2.0, radius, radius)
 
 
-def parts(asset, whole):
-    """Return the round trip cut off after each of its parts."""
+def broken(asset, point, radius):
+    """Return the state and the events after damage and split."""
+    return fracture.step(asset, *generate(asset, point, radius))
 
-    def generate(point, radius):
-        return damage.falloff(asset, whole, point, 2.0, radius, radius)
 
-    def apply(point, radius):
-        return fracture.apply(asset, whole, generate(point, radius))
+def round_trip(asset, point, radius):
+    """Return the state, the visible chunks and the events of a step of one body."""
+    state, events = broken(asset, point, radius)
+    return state, chunks.visible(asset, state), events
 
-    def split(point, radius):
-        return fracture.step(asset, whole, generate(point, radius))
 
-    return {"generate": generate, "+ apply": apply, "+ split": split}
+def moments(asset, state):
+    """Return mass, centre and inertia of the actors."""
+    return chunks.moments(asset, state, DENSITY)
 
 
 class Plain:
@@ -112,11 +108,12 @@ def by_networkx(edges, nodes):
     return label
 
 
-def batch_of(step, *arguments):
-    """Compile a step over a batch; return the call, seconds and bytes of scratch."""
-    compiled = jax.jit(jax.vmap(step)).lower(*arguments).compile()
+def batch_of(step, asset, *each):
+    """Compile a step over a batch; return the call and the bytes of scratch."""
+    axes = None, *[0 for _ in each]
+    compiled = jax.jit(jax.vmap(step, axes)).lower(asset, *each).compile()
     scratch = compiled.memory_analysis().temp_size_in_bytes
-    return lambda: jax.block_until_ready(compiled(*arguments)), scratch
+    return lambda: jax.block_until_ready(compiled(asset, *each)), scratch
 
 
 def measure(nodes, batch, cpp, repeats):
@@ -126,9 +123,8 @@ def measure(nodes, batch, cpp, repeats):
     whole = fracture.init(asset)
     rng = np.random.default_rng(nodes)
     point, radius = blasts(batch, rng)
-    ours, scratch = batch_of(round_trip(asset, whole), point, radius)
+    ours, scratch = batch_of(round_trip, asset, point, radius)
     state, visible, _ = ours()
-    moments, _ = batch_of(lambda s: chunks.moments(asset, s, DENSITY), state)
 
     edges = np.ascontiguousarray(asset.bond_nodes)
     alive = np.array(state.bond_intact)
@@ -137,13 +133,13 @@ def measure(nodes, batch, cpp, repeats):
     calls = {
         "union-find": lambda: cpp(edges, alive, label),
         "round trip": ours,
-        "moments": moments,
+        "moments": batch_of(moments, asset, state)[0],
         "SciPy": lambda: [plain.step(*x, by_scipy) for x in few],
     }
     if nodes <= SLOW:
         calls["NetworkX"] = lambda: [plain.step(*x, by_networkx) for x in few]
-    for name, part in parts(asset, whole).items():
-        calls[name], _ = batch_of(part, point, radius)
+    for name, part in (("generate", generate), ("+ split", broken)):
+        calls[name], _ = batch_of(part, asset, point, radius)
     times = least(calls, repeats)
 
     np.testing.assert_array_equal(state.actor[:, :nodes], label)
@@ -164,8 +160,8 @@ def alone(nodes, cpp, repeats):
     side = np.array(SIDES[nodes])
     asset = shapes.grid(tuple(side), tuple(1.0 / side), root=True)
     point, radius = blasts(1, np.random.default_rng(nodes))
-    step = jax.jit(round_trip(asset, fracture.init(asset)))
-    one = jnp.asarray(point[0]), jnp.asarray(radius[0])
+    step = jax.jit(round_trip)
+    one = asset, jnp.asarray(point[0]), jnp.asarray(radius[0])
     edges = np.ascontiguousarray(asset.bond_nodes)
     alive = np.array(step(*one)[0].bond_intact)[None]
     label = np.zeros((1, nodes), np.int32)
@@ -179,7 +175,7 @@ def alone(nodes, cpp, repeats):
 
 
 COLUMNS = ("union-find", "round trip", "moments", "SciPy", "NetworkX")
-STAGES = ("generate", "+ apply", "+ split")
+STAGES = ("generate", "+ split")
 
 
 def report(row):
@@ -221,7 +217,7 @@ def main(arguments=None):
     """Print the tables; write JSON and a picture where told to."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--nodes", type=int, nargs="+", default=[64, 512, 4096, 32768])
-    parser.add_argument("--batch", type=int, default=1024, help="up to 4,096 nodes")
+    parser.add_argument("--batch", type=int, default=1024, help="of 512 nodes")
     parser.add_argument("--repeats", type=int, default=9)
     parser.add_argument("--json", type=pathlib.Path)
     parser.add_argument("--picture", type=pathlib.Path)
@@ -239,8 +235,8 @@ def main(arguments=None):
     )
     rows = []
     for nodes in chosen.nodes:
-        # The largest body in a smaller batch: the arrays would fill the memory.
-        batch = chosen.batch if nodes <= 4096 else max(chosen.batch // 8, 1)
+        # As many nodes in all as in so many bodies of 512: memory is not what differs.
+        batch = max(chosen.batch * 512 // nodes, 32)
         rows.append(measure(nodes, batch, cpp, chosen.repeats))
         report(rows[-1])
     print("one body, dispatch included")

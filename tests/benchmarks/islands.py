@@ -202,17 +202,39 @@ def report(row):
     )
 
 
-def picture(rows, path):
-    from matplotlib import pyplot as plt
+NAMES = {
+    "scipy": "SciPy",
+    "cpp": "C++ union-find",
+    "vmap": "jax.vmap",
+    "lanes": "in lanes already",
+}
 
-    figure, axes = plt.subplots(figsize=(6, 4))
-    for key in ("scipy", "cpp", "vmap", "lanes"):
-        some = [r for r in rows if r["asset"].startswith("grid") and key in r]
-        some = [r for r in some if r["batch"] > 1]
-        axes.loglog([r["nodes"] for r in some], [r[key] for r in some], "o-", label=key)
-    axes.set(xlabel="nodes", ylabel="microseconds a body")
-    axes.legend()
-    figure.savefig(path, dpi=150, bbox_inches="tight")
+
+def picture(rows, path):
+    """Draw time against size and against batch, of grids with the mix of damage."""
+    from matplotlib import figure
+
+    canvas = figure.Figure(figsize=(9, 4), layout="constrained")
+    left, right = canvas.subplots(1, 2, sharey=True)
+    grids = [r for r in rows if r["asset"] == f"grid {r['nodes']}"]
+    full = max(r["batch"] for r in grids)
+    for axes, along, some in (
+        (left, "nodes", [r for r in grids if r["batch"] == full]),
+        (right, "batch", [r for r in grids if r["nodes"] == 512]),
+    ):
+        some = sorted(some, key=lambda r: r[along])
+        for key, name in NAMES.items():
+            with_it = [r for r in some if key in r]
+            x, y = ([r[k] for r in with_it] for k in (along, key))
+            axes.loglog(x, y, "o-", label=name)
+        x = [r[along] for r in some]
+        axes.grid(True, which="both", alpha=0.2)
+        axes.set_xticks(x, map(str, x))
+        axes.minorticks_off()
+    left.set(xlabel=f"nodes, batch {full}", ylabel="microseconds a body")
+    right.set(xlabel="batch, 512 nodes")
+    left.legend()
+    canvas.savefig(path, dpi=130)
 
 
 def main():
@@ -243,6 +265,11 @@ def main():
         ):
             rows.append(measure(label, place, edges, alive, cpp, chosen.repeats))
             report(rows[-1])
+        if name == "grid 512" and not chosen.quick:
+            for batch in (8, 32, 128):
+                few = mix[:batch]
+                rows.append(measure(name, place, edges, few, cpp, chosen.repeats))
+                report(rows[-1])
     for name, edges, num_nodes in (
         ("wall 16 x 16", grid((16, 1, 16))[1], 256),
         ("voronoi 512", voronoi(512)[1], 512),
