@@ -17,7 +17,7 @@ from mujoco import mjx
 from blastjax import chunks, fracture, graph, pytree, spatial
 from blastjax.core import NONE, Damage, FractureEvents, SplitEvents, State
 from blastjax.damage import falloff
-from blastjax.rigid import bodies, contact, engine, rows, solver
+from blastjax.rigid import bodies, contact, engine, resting, rows, solver
 from blastjax.rigid.scene import Scene
 from blastjax.stress.equilibrium import Structure
 from blastjax.stress.failure import Verdict, judge, stress_damage
@@ -229,7 +229,13 @@ def step(
     data = engine.position_sensors(model, data)
     data = engine.smooth_acceleration(model, data, bodies.empty_dofs(scene, riding))
     data, report = rows.resolve(scene, model, data, riding, frames, found.riders)
-    data = engine.integrate(model, data)
+    if scene.resting is None:
+        data = engine.integrate(model, data)
+    else:
+        solved = data.qacc
+        data, riding = resting.resist(scene, model, riding, frames, found.riders, data)
+        # The solver's own answer is the better guess for its next one.
+        data = engine.integrate(model, data).replace(qacc_warmstart=solved)
     force = contact.normal_force(data)
 
     world = world.replace(

@@ -14,22 +14,25 @@ are.
 | `bodies` | which actor rides in which slot, and where that puts its chunks |
 | `contact` | pairs, manifolds and caps; forces and impulses on the chunks |
 | `rows` | what contacts and the user's constraints ask of the solver |
+| `resting` | how what lies comes to rest, where a scene asks for it |
 | `hull` | convex hulls that differ, by one collider for all pairs |
 | `tables` | host: which hull each geom has, and the meshes that are drawn |
 | `solver` | the contact problem, by Newton's method with an implicit derivative |
 | `engine` | the only tie to MJX's private functions; a canary test watches it |
 """
 
-from blastjax.rigid import bodies, contact, engine, hull, rows, scene, solver
-from blastjax.rigid.scene import Scene, build
+from blastjax.rigid import bodies, contact, engine, hull, resting, rows, scene, solver
+from blastjax.rigid.scene import Resting, Scene, build
 
 __all__ = [
+    "Resting",
     "Scene",
     "bodies",
     "build",
     "contact",
     "engine",
     "hull",
+    "resting",
     "rows",
     "scene",
     "solver",

@@ -40,6 +40,11 @@ class Bodies(pytree.Node):
     """(K + 1, K + 1) int32 steps for which two slots still do not collide."""
     overlap: jax.Array
     """(K + 1, K + 1) depth to which two slots may overlap, m: see `contact`."""
+    way: jax.Array | None
+    """(K, 6) how far slots have come since they were last counted as moving, m and rad;
+    None in a scene without `resting`."""
+    calm: jax.Array | None
+    """(K,) for how long that has not been far, s; None likewise."""
 
 
 @pytree.dataclass
@@ -63,7 +68,7 @@ class Frames(pytree.Node):
 def nobody(scene: Scene) -> Bodies:
     """Return empty slots."""
     slots, elements = scene.slots, scene.asset.element_chunk.shape[0]
-    dtype = scene.position.dtype
+    dtype, sleeps = scene.position.dtype, scene.resting is not None
     return Bodies(
         slot=jnp.full(elements, NONE, jnp.int32),
         label=jnp.full(slots, NONE, jnp.int32),
@@ -72,6 +77,8 @@ def nobody(scene: Scene) -> Bodies:
         inertia=jnp.broadcast_to(jnp.eye(3, dtype=dtype), (slots, 3, 3)),
         grace=jnp.zeros((slots + 1, slots + 1), jnp.int32),
         overlap=jnp.zeros((slots + 1, slots + 1), dtype),
+        way=jnp.zeros((slots, 6), dtype) if sleeps else None,
+        calm=jnp.zeros(slots, dtype) if sleeps else None,
     )
 
 
@@ -229,6 +236,8 @@ def reassign(
             grace=_pass_on(bodies.grace, *family, grace_steps),
             overlap=_pass_on(bodies.overlap, *family, UNMEASURED),
         )
+    if now.calm is not None:
+        now = now.replace(calm=jnp.where(jnp.any(created), 0.0, now.calm))
     return now, _inherit(scene, bodies, now, data, origin, created)
 
 

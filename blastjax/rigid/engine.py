@@ -269,6 +269,31 @@ def normal_force(data: mjx.Data) -> jax.Array:
     return jnp.concatenate(parts)
 
 
+def stuck_force(data: mjx.Data) -> jax.Array:
+    """Return what of each contact's normal force sticks, and could, (contacts, 2) N.
+
+    All of it sticks where friction does nothing, and none where it does all it can: the
+    contact slides. Contacts without friction never stick.
+    """
+    impl = data._impl
+    start = impl.ne + impl.nf + impl.nl
+    parts = []
+    for size in (1, 3, 4, 6):
+        count = int(np.sum(impl.contact.dim == size))
+        if size == 1:
+            parts.append(jnp.zeros((count, 2), impl.efc_force.dtype))
+            start += count
+            continue
+        rows = 2 * (size - 1)
+        block = impl.efc_force[start : start + count * rows]
+        start += count * rows
+        # Of two opposite edges of the pyramid the weaker one is what friction spares.
+        edges = block.reshape(count, size - 1, 2)
+        spared = 2.0 * edges.min(axis=2).sum(axis=1)
+        parts.append(jnp.stack([spared, edges.sum(axis=(1, 2))], axis=1))
+    return jnp.concatenate(parts)
+
+
 def contact_force(data: mjx.Data) -> jax.Array:
     """Return the force of each contact on its second geom, (contacts, 3) N, world axes.
 

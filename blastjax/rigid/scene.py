@@ -67,6 +67,27 @@ class Host:
 
 
 @pytree.dataclass
+class Resting(pytree.Node):
+    """How what lies comes to rest: see `rigid.resting`.
+
+    Resistance and hold are parts of the load that a slot bears on the ground and on
+    what stands on it. What slides is left to friction, what flies to itself. What
+    stands on an edge may lean by about as many radians and not fall over, and what
+    moves on something that moves itself is not resisted by it.
+    """
+
+    resistance: jax.Array | float = 0.1
+    """() against rolling, rocking and twisting: of a wheel, about the coefficient of
+    rolling resistance."""
+    hold: jax.Array | float = 0.3
+    """() what something asleep withstands: more wakes it."""
+    speed: jax.Array | float = 0.01
+    """() what is slower than this for the delay falls asleep, m/s."""
+    delay: jax.Array | float = 0.2
+    """() s. Whenever something parts, all wake."""
+
+
+@pytree.dataclass
 class Scene(pytree.Node):
     """A breakable asset in a MuJoCo model; made by `build`."""
 
@@ -82,6 +103,8 @@ class Scene(pytree.Node):
     """() or (C,) density, kg/m^3."""
     hulls: Table | None
     """Convex hulls of the geoms, or None where chunks are boxes or spheres."""
+    resting: Resting | None
+    """How what lies comes to rest, or None if by friction alone."""
     host: Host = pytree.static()
     """The compiled model and the addresses of what was added to it."""
     line_search: int = pytree.static()
@@ -109,6 +132,7 @@ def build(
     collision: str = BOX,
     hulls: Hulls | None = None,
     chunk_contacts: bool = True,
+    resting: Resting | None = None,
     model: str | os.PathLike[str] | mujoco.MjSpec | None = None,
     timestep: float | None = None,
     iterations: int = 20,
@@ -133,6 +157,8 @@ def build(
       hulls: of the chunks, for "hull"; by default `author.hulls.fit` of a Destructible.
       chunk_contacts: whether chunks of different actors collide. Without, no such pair
         is in the program at all.
+      resting: how what lies comes to rest. By default by the contacts of MuJoCo alone,
+        which creep, and nothing of it is in the program.
       model: MJCF as a string, a path or an MjSpec (left as it is). By default a floor.
       timestep: s; by default the model's own.
       iterations: most Newton steps of the contact solver.
@@ -177,6 +203,9 @@ def build(
         raise ValueError(
             f"iterations {iterations} and line_search {line_search}: use at least 1"
         )
+    if resting is not None:
+        for field in dataclasses.fields(resting):
+            _positive(field.name, float(getattr(resting, field.name)), zero=True)
     weight = _density(asset, density)
     elements = _check_chunks(asset)
     slots = min(slots, len(elements))
@@ -226,6 +255,7 @@ def build(
         quaternion=cast(turn / length),
         density=cast(weight),
         hulls=jax.tree.map(cast, table),
+        resting=jax.tree.map(cast, resting),
         host=addresses,
         line_search=line_search,
     )
