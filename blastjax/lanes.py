@@ -28,7 +28,7 @@ DEGREES = (0, 1, 2, 3, 4, 6, 8, 12, 16)
 """Nodes' neighbours on one side are read in one step of the next such size."""
 GROUP = 4
 """Nodes that a sweep visits at a time: a step of a loop costs as much as some rows."""
-BLOCK = 32
+BLOCK = 8
 """Copies that are turned into lanes at a time; they divide those in a tile."""
 SURE = 3
 """Sweeps before it is worth a look whether anything still changes."""

@@ -272,6 +272,7 @@ def main():
                 report(rows[-1])
     for name, edges, num_nodes in (
         ("wall 16 x 16", grid((16, 1, 16))[1], 256),
+        ("grid 512", grid((8, 8, 8))[1], 512),
         ("voronoi 512", voronoi(512)[1], 512),
     ):
         for batch in (256, 1024):
