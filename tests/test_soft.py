@@ -11,6 +11,7 @@ from blastjax import author, chunks, fracture, graph, soft
 from blastjax.author import shapes
 from blastjax.core import UNBREAKABLE, Damage
 from blastjax.soft import chance
+from tests.benchmarks.islands import least
 
 pytestmark = pytest.mark.usefixtures("strict")
 
@@ -70,6 +71,21 @@ def test_margin_sign_is_connectivity():
 def test_margin_sign_is_connectivity_on_100_000_graphs():
     for seed in range(10):
         check_signs(seed, 5000)
+
+    # What that costs, in searches for islands of the same graphs.
+    edges, weight, source = random_graphs(0, 5000)
+    margins = jax.jit(jax.vmap(lambda e, w, s: graph.bottleneck(e, w, s, NODES)))
+    islands = jax.jit(jax.vmap(lambda e, a: graph.islands(e, a, NODES)))
+    times = least(
+        {
+            "margins": lambda: jax.block_until_ready(margins(edges, weight, source)),
+            "islands": lambda: jax.block_until_ready(islands(edges, weight > 0)),
+        },
+        20,
+    )
+    ratio = times["margins"] / times["islands"]
+    print(f"a margin costs {ratio:.1f} searches for islands")
+    assert ratio < 10
 
 
 def test_margin_slope_is_its_difference_quotient():
