@@ -109,9 +109,9 @@ def margin(
 def _margin(asset: Asset, weight: jax.Array, source: jax.Array) -> jax.Array:
     num_nodes = asset.span_node.shape[0]
     across = chunks.element_values(asset, asset.chunk_centroid)[:num_nodes, 0]
-    return graph.bottleneck(asset.bond_nodes, weight, source, num_nodes, place=across)[
-        0
-    ]
+    edges = asset.bond_nodes
+    least, _ = graph.bottleneck(edges, weight, source, num_nodes, place=across)
+    return least
 
 
 def perturbed_margin(
