@@ -115,7 +115,9 @@ def solve(frame, asset, state, load):
     return stress.solve(frame, asset, state, load, iterations=100)
 
 
-@pytest.mark.parametrize("method", ["two-level", "force"])
+@pytest.mark.parametrize(
+    "method", [pytest.param("two-level", marks=pytest.mark.slow), "force"]
+)
 def test_stress_survives_extreme_structures_loads_and_breaks(block, method):
     whole = fracture.init(block)
     plain = stress.structure(block, method=method)

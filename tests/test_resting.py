@@ -114,6 +114,7 @@ def test_a_sleeper_wakes_when_pushed_and_when_something_parts(block):
     np.testing.assert_allclose(parted.bodies.calm[:2], 24 * TIMESTEP, rtol=0.1)
 
 
+@pytest.mark.slow
 def test_flight_is_untouched_and_keeps_momentum(block):
     ends = []
     for case in block:
@@ -132,6 +133,7 @@ def test_flight_is_untouched_and_keeps_momentum(block):
     np.testing.assert_allclose(total, 1.0, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_rolling_ball_slows_down_by_the_resistance():
     # As deep as it lies: what is pushed out of the floor is not resisted.
     case = scene(Resting(resistance=0.1), cubes=1, sunk=6.9e-6, collision="sphere")

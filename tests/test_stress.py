@@ -241,7 +241,7 @@ def test_forces_are_those_of_a_direct_solve(x64, name, method):
     "name, method",
     [
         ("anchored", "two-level"),
-        ("pieces", "two-level"),
+        pytest.param("pieces", "two-level", marks=pytest.mark.slow),
         ("floating", "force"),
         ("broken", "force"),
     ],
@@ -304,7 +304,9 @@ def test_derivatives_are_central_differences(x64, name, method):
     assert abs(float(forward - reverse)) < SLOPE * total
 
 
-@pytest.mark.parametrize("method", ["two-level", "force"])
+@pytest.mark.parametrize(
+    "method", [pytest.param("two-level", marks=pytest.mark.slow), "force"]
+)
 def test_derivatives_in_float32_are_those_in_float64(method):
     def slope(kind):
         with jax.enable_x64(kind == np.float64):
@@ -325,8 +327,20 @@ def test_derivatives_in_float32_are_those_in_float64(method):
     assert error < 1e-5
 
 
-@pytest.mark.parametrize("method", ["two-level", "force"])
-@pytest.mark.parametrize("extreme", ["no load", "isolated nodes", "all broken", "soft"])
+EXTREMES = ("no load", "isolated nodes", "all broken", "soft")
+
+
+@pytest.mark.parametrize(
+    "extreme, method",
+    [
+        ("no load", "two-level"),
+        *((extreme, "force") for extreme in EXTREMES),
+        *(
+            pytest.param(extreme, "two-level", marks=pytest.mark.slow)
+            for extreme in EXTREMES[1:]
+        ),
+    ],
+)
 def test_extremes_stay_finite(method, extreme):
     asset, _ = CASES["anchored"](np.float32)
     state = fracture.init(asset)
@@ -407,6 +421,7 @@ def test_one_program_serves_every_state_of_breakage(count):
     assert len(traces) == 1
 
 
+@pytest.mark.slow
 def test_a_warm_start_saves_the_iterations():
     asset = shapes.grid((4, 1, 8), anchor=("z-",), dtype=np.float32)
     frame = stress.structure(asset, method="two-level")
