@@ -307,7 +307,7 @@ def test_fit_of_each_sample_leaves_it_out(samples):
         jnp.asarray(alive - p), jnp.asarray(value), jnp.asarray(variance)
     )
     ridge = np.zeros((9, 9))
-    np.fill_diagonal(ridge[1:, 1:], variance.sum() / 2)
+    np.fill_diagonal(ridge[1:, 1:], variance.sum() / 2 + 1)
     rows = np.concatenate([np.ones((samples, 1)), alive - p], axis=1)
     for i in range(samples):
         others = np.delete(rows, i, axis=0)

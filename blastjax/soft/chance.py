@@ -143,8 +143,10 @@ def _leave_one_out(
     Args:
       off: (K, B) survival of bonds less its probability.
       value: (K,) what to fit.
-      variance: (B,) of `off`. Half of its sum is the ridge: shrinking all gains alike
-        makes few samples of many bonds no worse than their mean alone.
+      variance: (B,) of `off`. The ridge is half of its sum, and one: shrinking all
+        gains alike makes few samples of many bonds no worse than their mean alone, and
+        without the one, what a sample of rare breaks leaves unexplained would be a
+        difference of equal numbers.
 
     Returns:
       (K,) values less their fit, and (K, B) the slopes of each sample's fit.
@@ -153,8 +155,7 @@ def _leave_one_out(
     # With the means taken off, the constant of the fit is left out of the ridge.
     off = off - jnp.mean(off, axis=0, keepdims=True)
     value = value - jnp.mean(value)
-    total = jnp.sum(variance)
-    ridge = jnp.where(total > 0, total / 2, 1)
+    ridge = jnp.sum(variance) / 2 + 1
     # off (off' off + ridge)^-1 by the smaller of its two equal forms.
     if bonds <= samples:
         gram = off.T @ off + ridge * jnp.eye(bonds, dtype=off.dtype)
