@@ -11,6 +11,7 @@ compilation is not counted. Methods take turns on every target.
 import argparse
 import functools
 import json
+import math
 import time
 
 import cma
@@ -290,10 +291,19 @@ def compare(problem, count, seconds, seed, show=True):
         for name in solvers
     }
     if show:
-        print(f"{problem.name}: {count} targets, at most {seconds:g} s each")
+        print(
+            f"{problem.name}: {count} targets, at most {seconds:g} s each; how many in"
+        )
+        print("  all, the median time, and how many when the first had 95 % of its own")
+        own = sorted(rows[next(iter(rows))]["seconds"])
+        limit = own[math.ceil(0.95 * len(own)) - 1]
         for name, row in rows.items():
             middle = row["median seconds"]
-            print(f"  {name:28s} {row['solved']:3d} / {count}  {middle:8.3f} s")
+            soon = sum(t <= limit for t in row["seconds"] if t < seconds)
+            print(
+                f"  {name:28s} {row['solved']:3d} / {count}  {middle:9.4f} s"
+                f"  {soon:3d} in {limit:.4f} s"
+            )
     return rows
 
 
