@@ -114,10 +114,10 @@ def in_tiles(
 
     def tile(weight: jax.Array, source: jax.Array) -> tuple[jax.Array, jax.Array]:
         cost, (free, none) = _cost(weight), _bounds(weight.dtype)
-        start = jnp.where(_rows(source, way.visit), free, none)
+        start = jnp.where(lanes.take_rows(source, way.visit), free, none)
         level, last = _levels(way, cost, start)
         edge = _follow(_steps(way, cost, level, last), cost.shape[0])
-        return _rows(level, way.turn), edge
+        return lanes.take_rows(level, way.turn), edge
 
     level, edge = lanes.tiled(tile, None, weight, source)
     return _weight(level, weight.dtype), edge.astype(jnp.int32)
@@ -274,7 +274,7 @@ def _steps(
     for side in (0, 1):
         one = functools.partial(visit, jnp.uint32(side))
         step = lax.fori_loop(jnp.uint32(0), jnp.uint32(num_rows), one, step)
-    return _rows(step, way.turn)
+    return lanes.take_rows(step, way.turn)
 
 
 def _follow(step: jax.Array, num_edges: int) -> jax.Array:
@@ -288,13 +288,6 @@ def _follow(step: jax.Array, num_edges: int) -> jax.Array:
         return step, jnp.any(step >= num_edges)
 
     return lax.while_loop(lambda c: c[1], double, (step, jnp.array(True)))[0]
-
-
-def _rows(x: jax.Array, i: jax.Array) -> jax.Array:
-    """Return rows i (n,) of x."""
-    dims = lax.GatherDimensionNumbers((1,), (0,), (0,))
-    sizes = (1, x.shape[1])
-    return lax.gather(x, i[:, None], dims, sizes, mode="promise_in_bounds")
 
 
 def _row(x: jax.Array, i: jax.Array) -> jax.Array:

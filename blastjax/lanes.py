@@ -186,13 +186,13 @@ def islands(way: Order, alive: jax.Array) -> jax.Array:
         labels: jax.Array, here: jax.Array, near: jax.Array, by: jax.Array
     ) -> jax.Array:
         del here
-        return jnp.where(_rows(alive, by), _rows(labels, near), none)
+        return jnp.where(take_rows(alive, by), take_rows(labels, near), none)
 
     def ease(labels: jax.Array, count: jax.Array) -> jax.Array:
         jumps = (count >= 2 * PATIENCE) & (count % 8 == 0)
         return lax.cond(jumps, lambda x: _jump(x, way), lambda x: x, labels)
 
-    return _rows(_settle(labels, way, offer, ease), way.turn)
+    return take_rows(_settle(labels, way, offer, ease), way.turn)
 
 
 def _sweep(
@@ -256,7 +256,7 @@ def _sweep(
     return lax.fori_loop(0, way.groups, visit, rows)
 
 
-def _rows(x: jax.Array, i: jax.Array) -> jax.Array:
+def take_rows(x: jax.Array, i: jax.Array) -> jax.Array:
     """Return rows i (n,) of x."""
     dims = lax.GatherDimensionNumbers((1,), (0,), (0,))
     sizes = (1, x.shape[1])
