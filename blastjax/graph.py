@@ -46,7 +46,7 @@ def islands(
         place = jnp.arange(num_nodes, dtype=jnp.int32)
     if num_nodes >= lanes.LIMIT:
         return _hook_and_jump(edges, place, alive)
-    search = _one(_hook_and_jump, lanes.in_tiles, 2)
+    search = one_of_many(_hook_and_jump, lanes.in_tiles, 2)
     return search(edges, jax.lax.stop_gradient(place), alive)
 
 
@@ -93,11 +93,11 @@ def side_by_side(
         tile = jax.vmap(functools.partial(one, *tables), in_axes=-1, out_axes=-1)
         return lanes.tiled(tile, dtype, *states)
 
-    return _one(rounds, sweeps, num_tables)
+    return one_of_many(rounds, sweeps, num_tables)
 
 
 @functools.cache
-def _one(rounds: Kernel, sweeps: Kernel, num_tables: int) -> Kernel:
+def one_of_many(rounds: Kernel, sweeps: Kernel, num_tables: int) -> Kernel:
     """Return a function of one state, which knows what a batch of states should do.
 
     Args:
@@ -244,7 +244,7 @@ def bottleneck(
         return least, jnp.full(num_nodes, -1, jnp.int32)
     if place is None:
         place = jnp.arange(num_nodes, dtype=jnp.int32)
-    search = _one(bottlenecks.rounds, bottlenecks.in_tiles, 2)
+    search = one_of_many(bottlenecks.rounds, bottlenecks.in_tiles, 2)
     # Searches run on constants: nothing in there is differentiated.
     least, edge = search(edges, *jax.lax.stop_gradient((place, weight)), source)
     edge = jnp.where(jnp.isfinite(least), edge, -1)
