@@ -5,13 +5,10 @@ that name, and rows that name no actor are zero or False. All of it is computed 
 state when asked, nothing is stored.
 """
 
-import functools
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 
-from blastjax import graph, pytree, spatial
+from blastjax import graph, pytree, sums
 from blastjax.core import NONE, Asset, State
 
 
@@ -209,7 +206,7 @@ def moments(asset: Asset, state: State, density: float | jax.Array) -> Moments:
       Moments by label. Differentiable in density, volumes, centroids and inertias; the
       grouping is constant.
 
-    A `vmap` over states alone, on the CPU, sums only over actors of several chunks.
+    A `vmap` over states alone, on the CPU, sums up actors of several chunks only.
     """
     density = jnp.broadcast_to(
         jnp.asarray(density, asset.chunk_volume.dtype), asset.chunk_volume.shape
@@ -217,165 +214,7 @@ def moments(asset: Asset, state: State, density: float | jax.Array) -> Moments:
     weight = element_values(asset, density * asset.chunk_volume)
     place = element_values(asset, asset.chunk_centroid)
     spin = element_values(asset, density[:, None, None] * asset.chunk_inertia)
-    mass, center, inertia = _sums(state.actor, weight, place, spin.reshape(-1, 9))
+    mass, center, inertia = sums.moments(
+        state.actor, weight, place, spin.reshape(-1, 9)
+    )
     return Moments(mass, center.reshape(-1, 3), inertia.reshape(-1, 3, 3))
-
-
-ROUNDS = 8
-"""Actors of several chunks that a body may have to be summed up with others."""
-TOGETHER = 8192
-"""Elements of bodies that are summed up side by side."""
-
-Sums = tuple[jax.Array, jax.Array, jax.Array]
-"""Masses (A,), centres (A * 3,) and inertias (A * 9,), or of a batch of bodies."""
-
-
-@jax.custom_jvp
-def _sums(
-    actor: jax.Array, weight: jax.Array, place: jax.Array, spin: jax.Array
-) -> Sums:
-    """Sum up elements of some weight (A,), place (A, 3) and inertia (A, 9) by actor."""
-    return graph.one_of_many(_by_scatter, _by_rounds, 3)(weight, place, spin, actor)
-
-
-@_sums.defjvp
-def _(primals: tuple[jax.Array, ...], tangents: tuple[Any, ...]) -> tuple[Sums, Sums]:
-    actor, *tables = primals
-    return jax.jvp(lambda *x: _by_scatter(*x, actor), tables, tangents[1:])
-
-
-def _middle(weight: jax.Array, place: jax.Array) -> jax.Array:
-    """Return a point to measure from, or float32 loses digits far from the origin."""
-    return jax.lax.stop_gradient(spatial.ratio(weight @ place, weight.sum()))
-
-
-def _by_scatter(
-    weight: jax.Array, place: jax.Array, spin: jax.Array, actor: jax.Array
-) -> Sums:
-    """Sum up one body: in two passes, for the second needs the actors' centres."""
-    middle = _middle(weight, place)
-    place = place - middle
-    sums = graph.group_sum(
-        jnp.concatenate([weight[:, None], weight[:, None] * place], axis=1),
-        actor,
-        actor.shape[0],
-    )
-    mass = sums[:, :1]
-    center = spatial.ratio(sums[:, 1:], mass)
-    # About the actor's own centre: the difference of two large sums would cost float32
-    # its digits.
-    arm = place - _take(center, actor, 0.0)
-    square = spatial.dot(arm, arm)[:, None, None] * jnp.eye(3, dtype=arm.dtype)[None]
-    steiner = (square - arm[:, :, None] * arm[:, None, :]).reshape(-1, 9)
-    inertia = graph.group_sum(spin + weight[:, None] * steiner, actor, actor.shape[0])
-    center = center + jnp.where(mass != 0, middle, 0)
-    return mass[:, 0], center.reshape(-1), inertia.reshape(-1)
-
-
-def _by_rounds(
-    weight: jax.Array, place: jax.Array, spin: jax.Array, actor: jax.Array
-) -> Sums:
-    """Sum up many bodies (T, A), of which most actors are one chunk: that is no sum."""
-    size, capacity = actor.shape
-    element = jnp.arange(capacity, dtype=actor.dtype)
-    width = min(max(TOGETHER // capacity, 4), size)
-    tiles = -(-size // width)
-    padded = jnp.pad(actor, ((0, tiles * width - size), (0, 0)), constant_values=-1)
-    # Not a vmap: every tile stops when it is done.
-    found = jax.lax.map(
-        functools.partial(_rounds, weight, place, spin),
-        padded.reshape(tiles, width, capacity),
-    )
-    label, mass, center, inertia, late = (
-        x.reshape(-1, *x.shape[2:])[:size] for x in found
-    )
-    # A product vectorises where a choice would not.
-    single = (actor == element).astype(weight.dtype)
-    near = jnp.where(weight[:, None] != 0, place, 0)
-    copy = jnp.arange(size, dtype=actor.dtype)[:, None]
-    out = (
-        (single * weight).at[copy, label].set(mass, mode="drop"),
-        (single[..., None] * near).at[copy, label].set(center, mode="drop"),
-        (single[..., None] * spin).at[copy, label].set(inertia, mode="drop"),
-    )
-    out = jax.tree.map(lambda x: x.reshape(size, -1), out)
-    # In the end what is in many pieces.
-    turn = jnp.argsort(~late)
-    number = late.sum()
-
-    def some(i: jax.Array, out: Sums) -> Sums:
-        place_in_turn = i * width + jnp.arange(width)
-        which = turn[jnp.minimum(place_in_turn, size - 1)]
-        group = actor[which]
-        group = jnp.where(group < 0, -1, group + capacity * jnp.arange(width)[:, None])
-        tables = (_repeat(x, width) for x in (weight, place, spin))
-        found = _by_scatter(*tables, group.reshape(-1))
-        which = jnp.where(place_in_turn < number, which, size)
-        return jax.tree.map(lambda x, y: x.at[which].set(y.reshape(width, -1), mode="drop"), out, found)
-
-    return jax.lax.fori_loop(0, -(-number // width), some, out)
-
-
-def _repeat(x: jax.Array, times: int) -> jax.Array:
-    return jnp.broadcast_to(x, (times, *x.shape)).reshape(-1, *x.shape[1:])
-
-
-def _rounds(
-    weight: jax.Array, place: jax.Array, spin: jax.Array, actor: jax.Array
-) -> tuple[jax.Array, ...]:
-    """Sum up a few bodies' actors of several chunks, one actor of each at a time.
-
-    Returns:
-      Their labels (n, ROUNDS), out of range where there is none; mass, centre and
-      inertia (n, ROUNDS, ...); and which bodies have more such actors, (n,) bool.
-    """
-    size, capacity = actor.shape
-    middle = _middle(weight, place)
-    place = place - middle
-    table = jnp.concatenate([weight[:, None], weight[:, None] * place, spin], axis=1)
-    # Who is in the actor of another; the labels they name are all there is to sum up.
-    joins = (actor >= 0) & (actor != jnp.arange(capacity, dtype=actor.dtype))
-    joined = jnp.where(joins, actor, capacity)
-
-    def after(label: jax.Array) -> jax.Array:
-        return jnp.min(jnp.where(joined > label[:, None], joined, capacity), axis=1)
-
-    def more(carry: tuple[Any, ...]) -> jax.Array:
-        return (carry[0] < ROUNDS) & jnp.any(carry[1] < capacity)
-
-    def take(carry: tuple[Any, ...]) -> tuple[Any, ...]:
-        i, label, out = carry
-        mask = jax.lax.optimization_barrier((actor == label[:, None]).astype(weight.dtype))
-        sums = jnp.dot(mask, table, precision="highest")
-        mass = sums[:, 0]
-        center = jax.lax.optimization_barrier(spatial.ratio(sums[:, 1:4], mass[:, None]))
-        arm = [mask * (place[:, k] - center[:, k, None]) for k in range(3)]
-        second = [[None] * 3 for _ in range(3)]
-        pairs = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]
-        for j, k in pairs:
-            product = jax.lax.optimization_barrier(arm[j] * arm[k])
-            second[j][k] = second[k][j] = jnp.dot(product, weight, precision="highest")
-        trace = second[0][0] + second[1][1] + second[2][2]
-        inertia = jnp.stack(
-            [
-                sums[:, 4 + 3 * j + k] + ((trace if j == k else 0) - second[j][k])
-                for j in range(3)
-                for k in range(3)
-            ],
-            axis=1,
-        )
-        center = center + jnp.where(mass[:, None] != 0, middle, 0)
-        found = label, mass, center, inertia
-        out = [x.at[:, i].set(y) for x, y in zip(out, found, strict=True)]
-        return i + 1, after(label), out
-
-    none = jnp.full((size, ROUNDS), capacity, actor.dtype)
-    zero = jnp.zeros((size, ROUNDS), weight.dtype)
-    start = [none, zero, jnp.stack([zero] * 3, -1), jnp.stack([zero] * 9, -1)]
-    first = after(jnp.full(size, -1, actor.dtype))
-    bits = jnp.where(joins, jnp.left_shift(1, actor % 32), 0)
-    seen = jax.lax.reduce(bits, jnp.int32(0), jax.lax.bitwise_or, (1,))
-    many = jax.lax.population_count(seen) > ROUNDS
-    first = jnp.where(many, capacity, first)
-    _, label, out = jax.lax.while_loop(more, take, (jnp.int32(0), first, start))
-    return *out, many | (label < capacity)
