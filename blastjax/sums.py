@@ -60,7 +60,7 @@ def moments(
 
 @moments.defjvp
 def _(primals: tuple[jax.Array, ...], tangents: tuple[Any, ...]) -> tuple[Sums, Sums]:
-    actor, *values = primals
+    actor, values = primals[0], primals[1:]
     return jax.jvp(lambda w, p, s: _by_scatter(w, p, s, actor), values, tangents[1:])
 
 

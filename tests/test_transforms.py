@@ -411,6 +411,7 @@ NO_DERIVATIVES = {
     "render": "host",
     "rigid": "world.step",
     "serialize": "host",
+    "sums": "chunks.moments",
     "wrappers": "host",
 }
 """The same for whole rooms."""
