@@ -382,6 +382,7 @@ MODULES = (
 )
 NO_DERIVATIVE = {
     "equilibrium.structure": "host",
+    "graph.one_of_many": "makes functions; fracture and chunks call them",
     "graph.side_by_side": "makes functions; fracture and chunks call them",
     "parity.network": "host",
     "parity.no_impulses": "host",
