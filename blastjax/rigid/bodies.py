@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import mujoco
 from mujoco import mjx
 
-from blastjax import chunks, pytree, spatial
+from blastjax import chunks, graph, pytree, spatial
 from blastjax.core import NONE, SplitEvents, State
 from blastjax.rigid import engine
 from blastjax.rigid.scene import Scene
@@ -270,9 +270,11 @@ def _inverse(matrix: jax.Array) -> jax.Array:
 
 def _ranking(scene: Scene, state: State) -> tuple[jax.Array, jax.Array]:
     """Return the K heaviest moving actors, (K,) labels, and all weights (A,) or 0."""
-    moments = chunks.moments(scene.asset, state, scene.density)
-    moving = chunks.active(scene.asset, state) & ~chunks.held(scene.asset, state)
-    weight = jax.lax.stop_gradient(jnp.where(moving, moments.mass, 0.0))
+    asset = scene.asset
+    weight = chunks.element_values(asset, scene.density * asset.chunk_volume)
+    mass = graph.group_sum(weight, state.actor, state.actor.shape[0])
+    moving = chunks.active(asset, state) & ~chunks.held(asset, state)
+    weight = jax.lax.stop_gradient(jnp.where(moving, mass, 0.0))
     _, order = jax.lax.top_k(weight, scene.slots)
     return order.astype(jnp.int32), weight
 
