@@ -65,19 +65,23 @@ def _(primals: tuple[jax.Array, ...], tangents: tuple[Any, ...]) -> tuple[Sums, 
 
 
 def _near(weight: jax.Array, place: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return places from the middle of all, and the middle (1, 3).
+    """Return places from one of them, and that place (1, 3).
 
     Far from the origin float32 has no digits left for their differences.
     """
-    middle = lax.stop_gradient(spatial.ratio(weight @ place, jnp.sum(weight)[None]))
-    return place - middle[None], middle[None]
+    # The first element is the world, perhaps, which is nowhere.
+    second = min(1, place.shape[0] - 1)
+    one = jnp.where(weight[:1, None] != 0, place[:1], place[second : second + 1])
+    one = lax.stop_gradient(one)
+    # Or XLA computes the difference anew wherever it is read.
+    return lax.optimization_barrier(place - one), one
 
 
 def _by_scatter(
     weight: jax.Array, place: jax.Array, spin: jax.Array, actor: jax.Array
 ) -> Sums:
     num = actor.shape[0]
-    place, middle = _near(weight, place)
+    place, origin = _near(weight, place)
     rows = jnp.concatenate([weight[:, None], weight[:, None] * place], axis=1)
     sums = graph.group_sum(rows, actor, num)
     mass = sums[:, :1]
@@ -90,7 +94,7 @@ def _by_scatter(
     inertia = graph.group_sum(
         spin + weight[:, None] * steiner.reshape(num, 9), actor, num
     )
-    center = center + jnp.where(mass != 0, middle, 0)
+    center = center + jnp.where(mass != 0, origin, 0)
     return mass[:, 0], center.reshape(-1), inertia.reshape(-1)
 
 
@@ -99,8 +103,10 @@ def _by_rounds(
 ) -> Sums:
     """Sum up many bodies, actors (T, A): results (T, ...)."""
     size, num = actor.shape
-    width = min(max(TOGETHER // num, 4), size)
+    width = max(TOGETHER // num, 4)
     tiles = -(-size // width)
+    if tiles < 2:
+        return jax.vmap(lambda x: _by_scatter(weight, place, spin, x))(actor)
     element = jnp.arange(num, dtype=actor.dtype)[None]
     # An element in the actor of another names an actor of several. At least as many
     # are named as bits are set, and bodies go with others of about as many.
@@ -170,7 +176,7 @@ def _rounds(
     size, num = named.shape
     block = min(num, BLOCK)
     spare = -num % block
-    place, middle = _near(weight, place)
+    place, origin = _near(weight, place)
     table = jnp.concatenate([weight[:, None], weight[:, None] * place, spin], axis=1)
     weight, place, table, named = (
         jnp.pad(x, pad)
@@ -209,7 +215,7 @@ def _rounds(
         second = jnp.sum(jnp.dot(second, ones, precision="highest"), axis=2)
         about = jnp.asarray(ABOUT, weight.dtype)
         inertia = sums[:, 4:] + jnp.dot(second.T, about, precision="highest")
-        center = center + jnp.where(mass != 0, middle, 0)
+        center = center + jnp.where(mass != 0, origin, 0)
         found = label, mass[:, 0], center, inertia
         out = [x.at[:, i].set(y) for x, y in zip(out, found, strict=True)]
         return i + 1, following(label), out
