@@ -106,6 +106,7 @@ def _by_rounds(
     width = max(TOGETHER // num, 4)
     tiles = -(-size // width)
     if tiles < 2:
+        # So few that starting all these kernels would cost more than they win.
         return jax.vmap(lambda x: _by_scatter(weight, place, spin, x))(actor)
     element = jnp.arange(num, dtype=actor.dtype)[None]
     # An element in the actor of another names an actor of several. At least as many

@@ -14,8 +14,8 @@ pytestmark = pytest.mark.usefixtures("strict")
 
 DIGITS = {np.float32: 1e-6, np.float64: 1e-13}
 """Of an actor's own mass, size and trace: a few roundings."""
-LONG_SUM = 2e-5
-"""Tens of thousands of like numbers, added in a row in float32."""
+LONG_SUM = 2e-4
+"""32,768 numbers added in a row in float32, where one body alone is scattered."""
 
 
 def wall(dtype=np.float32, away=0.0):
@@ -162,9 +162,9 @@ def test_derivatives_of_a_batch_are_finite_differences():
 
 
 def test_moments_of_batches_of_batches():
-    asset, rng = wall(), np.random.default_rng(7)
+    asset = wall()
     state = fracture.init(asset)
-    actor = labels(asset, 12, rng)
+    actor = labels(asset, 132, np.random.default_rng(7))
     density = jnp.asarray([1.0, 3.0], jnp.float32)
     plain = of_batch(asset, state, actor, 1.0)
 
@@ -172,13 +172,13 @@ def test_moments_of_batches_of_batches():
         return chunks.moments(asset, state.replace(actor=actor), density)
 
     over = functools.partial(jax.vmap, in_axes=(0, None))
-    nested = jax.jit(over(over(one)))(actor.reshape(3, 4, -1), 1.0)
+    nested = jax.jit(over(over(one)))(actor.reshape(3, 44, -1), 1.0)
     scaled = jax.jit(jax.vmap(over(one), in_axes=(None, 0)))(actor, density)
     by_scan = jax.lax.scan(lambda _, x: (0, over(one)(x, 1.0)), 0, actor[None])[1]
     for name in ("mass", "center", "inertia"):
         flat = getattr(plain, name)
         again = getattr(nested, name).reshape(flat.shape)
-        np.testing.assert_array_equal(again, flat)
-        np.testing.assert_allclose(getattr(by_scan, name)[0], flat, rtol=1e-6)
+        np.testing.assert_allclose(again, flat, 1e-5, 1e-5)
+        np.testing.assert_allclose(getattr(by_scan, name)[0], flat, 1e-5, 1e-5)
         heavy = flat if name == "center" else 3 * flat
         np.testing.assert_allclose(getattr(scaled, name)[1], heavy, 1e-5, 1e-5)
