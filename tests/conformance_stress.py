@@ -49,6 +49,8 @@ STEPS_RTOL = 0.15
 """Of steps, where error norms are noisy too."""
 SAME_NORMS = 1e-2
 """Error norms this close come from the same number of steps."""
+MOST_STEPS = 100_000
+"""A corrupt limit must not keep a solve going for hours."""
 TINY = 1e-30
 
 CAPACITIES = (112, 256), (448, 832), (2048, 5376)
@@ -213,7 +215,7 @@ class Replay:
             start,
             pull,
             self.limits,
-            max_iterations=np.int32(self.case["case_max_iter"]),
+            max_iterations=np.int32(min(self.case["case_max_iter"], MOST_STEPS)),
             cold=np.bool_(frame["frame_reset"]),
         )
         return jax.tree.map(np.asarray, result)

@@ -5,22 +5,38 @@ case (or to an op, a state, an actor) is written in other columns. Every row mus
 to something: a column that is too short or too long raises ValueError.
 """
 
+import pathlib
+
 import numpy as np
+
+DATA = pathlib.Path(__file__).parent / "data"
 
 
 class Columns:
     """The columns of one file, each read once from its first to its last row."""
 
-    def __init__(self, path):
+    def __init__(self, path, kind):
         with np.load(path) as file:
             self.data = {name: file[name] for name in file.files}
+        self._check_columns(kind)
         self.at = dict.fromkeys(self.data, 0)
         self.groups = {}
 
+    def _check_columns(self, kind):
+        """Refuse a file whose columns have another type or width than ours."""
+        with np.load(DATA / f"{kind}.npz") as file:
+            for name in file.files:
+                if name not in self.data:
+                    raise ValueError(f"column {name} is missing")
+                ours, theirs = (
+                    (x.dtype, x.ndim, x.shape[1:])
+                    for x in (file[name], self.data[name])
+                )
+                if ours != theirs:
+                    raise ValueError(f"column {name} is {theirs} instead of {ours}")
+
     def rows(self, name, count):
         """Return the next `count` rows of a column."""
-        if name not in self.data:
-            raise ValueError(f"column {name} is missing")
         start, stop = self.at[name], self.at[name] + int(count)
         if stop > len(self.data[name]):
             raise ValueError(f"column {name} ends before row {stop}")
@@ -75,7 +91,7 @@ def lowlevel_cases(path):
     Columns keep their names. `ops`, `splits` and `states` are lists by round (round 0
     is the creation); of these, ops and splits are lists again.
     """
-    columns = Columns(path)
+    columns = Columns(path, "lowlevel")
     for _ in range(len(columns.data["case_id"])):
         yield _lowlevel_case(columns)
     columns.finish("case_id")
@@ -91,6 +107,10 @@ def _lowlevel_case(columns):
     case |= columns.ragged("adj_partition", int(case["case_n_node"]) + 1)
     case |= columns.ragged("adj_node adj_bond", 2 * int(case["case_n_bond"]))
     rounds = int(case["case_n_round"])
+    if rounds >= len(columns.data["state_round"]):
+        raise ValueError(
+            f"case {case['case_id']} has {rounds} rounds, of too few states"
+        )
     ops = [_op(columns) for _ in range(int(case["case_n_op"]))]
     splits = [_split(columns) for _ in range(int(case["case_n_split"]))]
     case["ops"] = _by_round(ops, "op", case["case_id"], rounds)
@@ -146,7 +166,7 @@ def _by_round(rows, what, case_id, rounds):
 
 def desc_cases(path):
     """Yield the cases of a recording of chunk descriptors, a dict each."""
-    columns = Columns(path)
+    columns = Columns(path, "desc")
     for _ in range(len(columns.data["desc_id"])):
         yield _desc_case(columns)
     columns.finish("desc_id")
@@ -164,7 +184,7 @@ def stress_cases(path):
 
     Columns keep their names; `frames` is a list of dicts, one an update.
     """
-    columns = Columns(path)
+    columns = Columns(path, "stress")
     for _ in range(len(columns.data["case_id"])):
         yield _stress_case(columns)
     columns.finish("case_id")
