@@ -47,7 +47,7 @@ def moments(
     """Sum up elements by their actor.
 
     Args:
-      actor: (A,) labels, negative for none.
+      actor: (A,) labels, the smallest element of each actor; negative for none.
       weight: (A,) kg.
       place: (A, 3) centres of mass, m.
       spin: (A, 9) inertias about them, kg m^2.
