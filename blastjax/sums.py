@@ -65,16 +65,19 @@ def _(primals: tuple[jax.Array, ...], tangents: tuple[Any, ...]) -> tuple[Sums, 
 
 
 def _near(weight: jax.Array, place: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return places from one of them, and that place (1, 3).
+    """Return places from the middle of them all, and that middle (1, 3).
 
-    Far from the origin float32 has no digits left for their differences.
+    Far from it float32 has no digits left for their differences, and long sums of
+    numbers of one sign lose them too.
     """
-    # The first element is the world, perhaps, which is nowhere.
+    # From one of them first; the first of all is the world, perhaps, which is nowhere.
     second = min(1, place.shape[0] - 1)
     one = jnp.where(weight[:1, None] != 0, place[:1], place[second : second + 1])
-    one = lax.stop_gradient(one)
+    about = jnp.where(weight[:, None] != 0, place - one, 0)
+    middle = one + spatial.ratio(weight @ about, jnp.sum(weight))[None]
+    middle = lax.stop_gradient(middle)
     # Or XLA computes the difference anew wherever it is read.
-    return lax.optimization_barrier(place - one), one
+    return lax.optimization_barrier(place - middle), middle
 
 
 def _by_scatter(
