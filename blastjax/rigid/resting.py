@@ -28,7 +28,7 @@ from blastjax.rigid.bodies import Bodies, Frames
 from blastjax.rigid.contact import Riders
 from blastjax.rigid.scene import Scene
 
-_SLACK = 0.1
+_SLACK = 0.3
 """Contacts that part faster than by this part of the resistance do not resist."""
 
 
@@ -56,13 +56,17 @@ def resist(
     size = jnp.sqrt(jnp.where(moving, square, 1.0))
 
     # What is pushed out of another is not held in it.
-    slack = _SLACK * resting.resistance * spatial.norm(model.opt.gravity) * timestep
-    parts = _parting(carried, frames, data, velocity) > slack
-    force = jnp.where(parts[:, None], 0.0, engine.stuck_force(data))
-    sticks, presses = load(scene, carried, data, force).T * timestep
-    hold = jnp.where(calm > resting.delay, resting.hold, resting.resistance)
-    lost = jnp.minimum(resting.resistance * sticks / size, 1.0)
-    lost = jnp.where(hold * presses >= size, 1.0, lost)
+    apart = _parting(carried, frames, data, velocity)
+    slack = _SLACK * spatial.norm(model.opt.gravity) * timestep
+    sticking, pressing = engine.stuck_force(data).T
+    parts, pops = (apart > slack * x for x in (resting.resistance, resting.hold))
+    stuck = jnp.where(parts, 0.0, jnp.stack([sticking, pressing]))
+    forces = jnp.concatenate([stuck, jnp.where(pops, 0.0, pressing)[None]]).T
+    sticks, presses, bears = load(scene, carried, data, forces).T * timestep
+    asleep = calm > resting.delay
+    drag = jnp.where(asleep, resting.hold * bears, resting.resistance * sticks)
+    stops = ~asleep & (resting.resistance * presses >= size)
+    lost = jnp.where(stops, 1.0, jnp.minimum(drag / size, 1.0))
     lost = jnp.where(moving, lost, 0.0)[:, None]
     # Integrators that damp implicitly start from the force, others from its effect.
     pull = data.qfrc_constraint.at[dof].add(-lost * momentum / timestep)
@@ -93,10 +97,10 @@ def load(scene: Scene, carried: Riders, data: mjx.Data, force: jax.Array) -> jax
     ground, others = between[:, slots], between[:, :slots]
     if not scene.host.chunk_kinds:
         return ground
-    reach = jnp.eye(slots, dtype=bool) | (others[..., 0] > 0)
+    reach = jnp.eye(slots, dtype=bool) | (others[..., 2] > 0)
     for _ in range(math.ceil(math.log2(slots))):
         reach = jnp.any(reach[:, :, None] & reach[None], axis=1)
-    stands = jnp.any(reach & (ground[:, 0] > 0)[None], axis=1)
+    stands = jnp.any(reach & (ground[:, 2] > 0)[None], axis=1)
     return ground + jnp.sum(jnp.where(stands[:, None], others, 0.0), axis=1)
 
 
