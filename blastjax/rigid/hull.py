@@ -30,6 +30,9 @@ _FAR = 1.0
 _FACE_BIAS = 0.95
 """A crossing of edges must be this much shallower than a face to be preferred: faces
 give a whole outline, and two answers of equal depth must not take turns."""
+_FACE_SLOP = 0.01
+"""They must also be this much shallower, of the first hull's size, or shallower than
+all points in which the faces meet: a whole outline must not vanish for a hair."""
 _ANGLE = 0.3 + np.arange(POINTS - 1) * 2 * np.pi / (POINTS - 1)
 """Directions of the outline, rad: crooked, so that a face's corners do not tie."""
 
@@ -186,8 +189,11 @@ def meet(a: _Solid, b: _Solid) -> tuple[jax.Array, jax.Array, jax.Array]:
     normal = jnp.where(swap, -own[1], own[1])
     edge_a, edge_b, best_edge = _edge_gap(still_a, still_b)
     crossing = best_edge * jnp.where(best_edge < 0, 1 / _FACE_BIAS, _FACE_BIAS)
-    # Measured where the faces meet: a vertex elsewhere may be deeper for no reason.
-    by_edges = crossing > jnp.min(jax.lax.stop_gradient(distance)) + slack
+    by_edges = crossing > best_face + slack
+    # Where the faces meet they may be no deeper than the edges, if a vertex is elsewhere.
+    deepest = jnp.min(jax.lax.stop_gradient(distance))
+    slop = _FACE_SLOP * jnp.max(jnp.abs(still_a.offset))
+    by_edges &= (crossing > deepest + slack) | (best_edge > best_face + slop)
     gap, place, across = _edge_contact(a, b, edge_a, edge_b)
     single = jnp.full_like(distance, _FAR).at[0].set(gap)
     distance = jnp.where(by_edges, single, distance)
