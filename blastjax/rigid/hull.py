@@ -190,7 +190,7 @@ def meet(a: _Solid, b: _Solid) -> tuple[jax.Array, jax.Array, jax.Array]:
     edge_a, edge_b, best_edge = _edge_gap(still_a, still_b)
     crossing = best_edge * jnp.where(best_edge < 0, 1 / _FACE_BIAS, _FACE_BIAS)
     by_edges = crossing > best_face + slack
-    # Where the faces meet they may be no deeper than the edges, if a vertex is elsewhere.
+    # Where the faces meet they may be no deeper than the edges: a vertex elsewhere is.
     deepest = jnp.min(jax.lax.stop_gradient(distance))
     slop = _FACE_SLOP * jnp.max(jnp.abs(still_a.offset))
     by_edges &= (crossing > deepest + slack) | (best_edge > best_face + slop)

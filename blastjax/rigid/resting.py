@@ -34,7 +34,7 @@ from blastjax.rigid.scene import Scene
 _SLACK = 0.01
 """Contacts that part faster than by this part of a step of gravity do not resist."""
 _POP = 0.1
-"""The same part for what is asleep: if it only slides, its contacts part more slowly."""
+"""The same part for what is asleep: where it only slides, contacts part more slowly."""
 
 
 def resist(
