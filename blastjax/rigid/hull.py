@@ -30,6 +30,9 @@ _FAR = 1.0
 _FACE_BIAS = 0.95
 """A crossing of edges must be this much shallower than a face to be preferred: faces
 give a whole outline, and two answers of equal depth must not take turns."""
+_FACE_SLOP = 0.01
+"""They must also be this much shallower, of the first hull's size, or shallower than
+all points in which the faces meet: a whole outline must not vanish for a hair."""
 _ANGLE = 0.3 + np.arange(POINTS - 1) * 2 * np.pi / (POINTS - 1)
 """Directions of the outline, rad: crooked, so that a face's corners do not tie."""
 
@@ -175,19 +178,22 @@ def meet(a: _Solid, b: _Solid) -> tuple[jax.Array, jax.Array, jax.Array]:
     slack = 1e-5 * (jnp.abs(best_a) + jnp.max(jnp.abs(still_a.offset)))
     swap = best_b > best_a + slack
     best_face = jnp.where(swap, best_b, best_a)
-    edge_a, edge_b, best_edge = _edge_gap(still_a, still_b)
-    crossing = best_edge * jnp.where(best_edge < 0, 1 / _FACE_BIAS, _FACE_BIAS)
-    by_edges = crossing > best_face + slack
 
     def pick(x: jax.Array, y: jax.Array) -> jax.Array:
         return jnp.where(swap, y, x)
 
     own = jax.tree.map(pick, _face(a, face_a), _face(b, face_b))
-    other_a, other_b = _facing(a, own[1]), _facing(b, own[1])
+    (other_a, low_a), (other_b, low_b) = _facing(a, own[1]), _facing(b, own[1])
     other = jax.tree.map(pick, _face(b, other_b), _face(a, other_a))
-    vertices = _extreme(a, b, own[1], swap)
-    distance, point = _face_contacts(own, other, vertices)
+    distance, point = _face_contacts(own, other, pick(low_b, low_a))
     normal = jnp.where(swap, -own[1], own[1])
+    edge_a, edge_b, best_edge = _edge_gap(still_a, still_b)
+    crossing = best_edge * jnp.where(best_edge < 0, 1 / _FACE_BIAS, _FACE_BIAS)
+    by_edges = crossing > best_face + slack
+    # Where the faces meet they may be no deeper than the edges: a vertex elsewhere is.
+    deepest = jnp.min(jax.lax.stop_gradient(distance))
+    slop = _FACE_SLOP * jnp.max(jnp.abs(still_a.offset))
+    by_edges &= (crossing > deepest + slack) | (best_edge > best_face + slop)
     gap, place, across = _edge_contact(a, b, edge_a, edge_b)
     single = jnp.full_like(distance, _FAR).at[0].set(gap)
     distance = jnp.where(by_edges, single, distance)
@@ -288,17 +294,22 @@ def _face(solid: _Solid, face: jax.Array) -> Face:
     return corners, solid.normal[face], solid.size[face]
 
 
-def _facing(solid: _Solid, normal: jax.Array) -> jax.Array:
-    """Return the face that looks most against a normal."""
-    return jnp.argmin(solid.normal @ jax.lax.stop_gradient(normal))
+def _facing(solid: _Solid, normal: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return the face that meets one with a normal, and the vertex lowest over that.
 
-
-def _extreme(a: _Solid, b: _Solid, normal: jax.Array, swap: jax.Array) -> jax.Array:
-    """Return the other hull's lowest vertex over the face with the normal."""
+    It is the one that looks most against the normal, of those at the lowest edge: a
+    face elsewhere can look more against it and not meet it at all.
+    """
     toward = jax.lax.stop_gradient(normal)
-    low_a = a.vertices[jnp.argmin(a.vertices @ toward)]
-    low_b = b.vertices[jnp.argmin(b.vertices @ toward)]
-    return jnp.where(swap, low_a, low_b)
+    height = solid.vertices @ toward
+    lowest = jnp.argmin(height)
+    # Padding repeats vertices.
+    again = jnp.all(solid.vertices == solid.vertices[lowest], axis=1)
+    next_lowest = jnp.argmin(jnp.where(again, jnp.inf, height))
+    at_lowest = jnp.any(solid.corners == lowest, axis=1)
+    at_both = at_lowest & jnp.any(solid.corners == next_lowest, axis=1)
+    ahead = at_lowest.astype(height.dtype) + at_both
+    return jnp.argmin(solid.normal @ toward - 3.0 * ahead), solid.vertices[lowest]
 
 
 def _ring(face: Face) -> tuple[jax.Array, jax.Array, jax.Array]:

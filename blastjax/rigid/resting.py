@@ -8,11 +8,14 @@ move by millimetres a second, for seconds.
 Here a slot loses speed at the rate c L / m of its mass m and the load L that it bears
 on contacts that stick: dry friction against all six motions at once, speed being that
 of the kinetic energy. What would come to a stop within the step if all its contacts
-stuck does stop. A slot that has hardly moved for a while is asleep, and then withstands
-more before it moves. A contact that parts is left out: what slides is lifted, what was
-pressed too deep is pushed out, and to hold either sets off the hopping again. Only the
-ground resists, and what stands on it, directly or through others: among pieces in
-flight momentum is kept. Sizes: K slots, C contacts.
+stuck does stop. A contact that parts is left out: what slides is lifted, what was
+pressed too deep is pushed out, and to hold either sets off the hopping again.
+
+A slot that has hardly moved for a while is asleep, and then brakes by more, on all
+contacts, whether they stick or slide: it is what slides so slowly that would otherwise
+hop on for seconds. Only what pops out of another is left out. Only the ground resists,
+and what stands on it, directly or through others: among pieces in flight momentum is
+kept. Sizes: K slots, C contacts.
 """
 
 import math
@@ -28,8 +31,10 @@ from blastjax.rigid.bodies import Bodies, Frames
 from blastjax.rigid.contact import Riders
 from blastjax.rigid.scene import Scene
 
-_SLACK = 0.1
-"""Contacts that part faster than by this part of the resistance do not resist."""
+_SLACK = 0.01
+"""Contacts that part faster than by this part of a step of gravity do not resist."""
+_POP = 0.1
+"""The same part for what is asleep: where it only slides, contacts part more slowly."""
 
 
 def resist(
@@ -56,13 +61,17 @@ def resist(
     size = jnp.sqrt(jnp.where(moving, square, 1.0))
 
     # What is pushed out of another is not held in it.
-    slack = _SLACK * resting.resistance * spatial.norm(model.opt.gravity) * timestep
-    parts = _parting(carried, frames, data, velocity) > slack
-    force = jnp.where(parts[:, None], 0.0, engine.stuck_force(data))
-    sticks, presses = load(scene, carried, data, force).T * timestep
-    hold = jnp.where(calm > resting.delay, resting.hold, resting.resistance)
-    lost = jnp.minimum(resting.resistance * sticks / size, 1.0)
-    lost = jnp.where(hold * presses >= size, 1.0, lost)
+    apart = _parting(carried, frames, data, velocity)
+    fall = spatial.norm(model.opt.gravity) * timestep
+    parts, pops = apart > _SLACK * fall, apart > _POP * fall
+    sticking, pressing = engine.stuck_force(data).T
+    stuck = jnp.where(parts, 0.0, jnp.stack([sticking, pressing]))
+    forces = jnp.concatenate([stuck, jnp.where(pops, 0.0, pressing)[None]]).T
+    sticks, presses, bears = load(scene, carried, data, forces).T * timestep
+    asleep = calm > resting.delay
+    drag = jnp.where(asleep, resting.hold * bears, resting.resistance * sticks)
+    stops = ~asleep & (resting.resistance * presses >= size)
+    lost = jnp.where(stops, 1.0, jnp.minimum(drag / size, 1.0))
     lost = jnp.where(moving, lost, 0.0)[:, None]
     # Integrators that damp implicitly start from the force, others from its effect.
     pull = data.qfrc_constraint.at[dof].add(-lost * momentum / timestep)
@@ -81,7 +90,7 @@ def resist(
 def load(scene: Scene, carried: Riders, data: mjx.Data, force: jax.Array) -> jax.Array:
     """Sum forces (C, n) on the ground and on what stands on it, over slots, (K, n).
 
-    A slot stands if forces of the first kind lead from it to the ground.
+    A slot stands if forces of the last kind lead from it to the ground.
     """
     slots, pair = scene.slots, data._impl.contact.geom
     # What the world holds is ground, and so are the user's geoms that cannot move.
@@ -93,10 +102,10 @@ def load(scene: Scene, carried: Riders, data: mjx.Data, force: jax.Array) -> jax
     ground, others = between[:, slots], between[:, :slots]
     if not scene.host.chunk_kinds:
         return ground
-    reach = jnp.eye(slots, dtype=bool) | (others[..., 0] > 0)
+    reach = jnp.eye(slots, dtype=bool) | (others[..., -1] > 0)
     for _ in range(math.ceil(math.log2(slots))):
         reach = jnp.any(reach[:, :, None] & reach[None], axis=1)
-    stands = jnp.any(reach & (ground[:, 0] > 0)[None], axis=1)
+    stands = jnp.any(reach & (ground[:, -1] > 0)[None], axis=1)
     return ground + jnp.sum(jnp.where(stands[:, None], others, 0.0), axis=1)
 
 

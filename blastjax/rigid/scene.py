@@ -76,12 +76,12 @@ class Resting(pytree.Node):
     moves on something that moves itself is not resisted by it.
     """
 
-    resistance: jax.Array | float = 0.1
+    resistance: jax.Array | float = 0.15
     """() against rolling, rocking and twisting: of a wheel, about the coefficient of
     rolling resistance."""
     hold: jax.Array | float = 0.3
     """() what something asleep withstands: more wakes it."""
-    speed: jax.Array | float = 0.01
+    speed: jax.Array | float = 0.02
     """() what is slower than this for the delay falls asleep, m/s."""
     delay: jax.Array | float = 0.2
     """() s. Whenever something parts, all wake."""

@@ -25,7 +25,8 @@ from blastjax.rigid import Resting, build
 from tests import pieces
 
 FLOOR = """
-<mujoco><option timestep="0.004" impratio="{}"/><worldbody>
+<mujoco><option timestep="0.004" impratio="{}"/>
+<default><geom solref="0.015 1"/></default><worldbody>
 <light pos="0 0 3" directional="true"/>
 <geom name="floor" type="plane" size="0 0 .05" friction="{} .005 .0001"/>
 </worldbody></mujoco>
