@@ -176,7 +176,7 @@ def _apply_to_chunks(
     siblings = jnp.maximum(chunks.element_values(asset, asset.chunk_children), 1)
     offer = excess
     for _ in range(asset.depth):
-        share = (offer / siblings.astype(offer.dtype))[parent]
+        share = _lookup(offer / siblings.astype(offer.dtype), parent)
         share = jnp.where((asset.element_parent >= 0) & damageable, share, 0)
         offer = jnp.maximum(share - health, 0)
         offer = jnp.where(share > 0, offer, 0)
@@ -184,6 +184,15 @@ def _apply_to_chunks(
         taken = taken + share
         excess = excess + offer
     return state.replace(chunk_health=health), taken, excess
+
+
+def _lookup(x: jax.Array, index: jax.Array) -> jax.Array:
+    """Return the entries of x (A,) at index (A,), the same for all bodies."""
+    # As if each body had its own: a gather of all at once would leave its result the
+    # other way round in memory, and all that reads it would be slow. Behind a barrier,
+    # or XLA computes x anew for each entry that is looked up.
+    index = index + 0 * (x != x).astype(index.dtype)
+    return jax.lax.optimization_barrier(x)[index]
 
 
 @jax.custom_batching.custom_vmap
@@ -308,8 +317,8 @@ def split(
         gives_way = (state.chunk_health <= 0) & chunks.has_children(asset)
         released = chosen & chunks.alone(asset, state) & gives_way
         for _ in range(asset.depth):
-            freed = (asset.element_parent >= 0) & released[parent]
-            origin = jnp.where(freed, origin[parent], origin)
+            freed = (asset.element_parent >= 0) & _lookup(released, parent)
+            origin = jnp.where(freed, _lookup(origin, parent), origin)
             actor = jnp.where(freed, elements, actor)
             released = released | (freed & gives_way)
         state = state.replace(actor=jnp.where(released, NONE, actor))
