@@ -149,6 +149,7 @@ def test_derivatives_of_a_batch_are_finite_differences():
             )
             return jax.vmap(functools.partial(energy, changed, state, density))(actor)
 
+        @jax.jit
         def along(t):
             return at(*(x + t * y for x, y in zip(point, way, strict=True)))
 
@@ -156,7 +157,8 @@ def test_derivatives_of_a_batch_are_finite_differences():
         slope = (along(step) - along(-step)) / (2 * step)
         _, forward = jax.jvp(along, (0.0,), (1.0,))
         np.testing.assert_allclose(forward, slope, rtol=1e-7, atol=1e-7)
-        gradient = jax.grad(lambda *x: at(*x).sum(), argnums=(0, 1, 2, 3))(*point)
+        gradient = jax.grad(lambda *x: at(*x).sum(), argnums=(0, 1, 2, 3))
+        gradient = jax.jit(gradient)(*point)
         reverse = sum(jnp.vdot(x, y) for x, y in zip(gradient, way, strict=True))
         np.testing.assert_allclose(reverse, forward.sum(), rtol=1e-12)
 
