@@ -13,7 +13,7 @@ from blastjax.core import NONE
 pytestmark = pytest.mark.usefixtures("strict")
 
 DIGITS = {np.float32: 1e-6, np.float64: 1e-13}
-"""Of an actor's own mass, size and trace: a few roundings."""
+"""Of an actor's mass, its distance and the trace of its inertia: a few roundings."""
 LONG_SUM = 2e-5
 """32,768 numbers added in a row in float32, where one body alone is scattered."""
 

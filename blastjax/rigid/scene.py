@@ -71,9 +71,10 @@ class Resting(pytree.Node):
     """How what lies comes to rest: see `rigid.resting`.
 
     Resistance and hold are parts of the load that a slot bears on the ground and on
-    what stands on it. What slides is left to friction, what flies to itself. What
-    stands on an edge may lean by about as many radians and not fall over, and what
-    moves on something that moves itself is not resisted by it.
+    what stands on it. What slides is left to friction until it is slow enough to fall
+    asleep, what flies to itself. What stands on an edge may lean by about as many
+    radians and not fall over, and what moves on something that moves itself is not
+    resisted by it.
     """
 
     resistance: jax.Array | float = 0.15
