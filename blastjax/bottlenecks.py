@@ -21,7 +21,7 @@ from blastjax import lanes
 
 
 def rounds(
-    edges: jax.Array, place: jax.Array, weight: jax.Array, source: jax.Array
+    edges: jax.Array, weight: jax.Array, source: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Search one graph.
 
@@ -31,7 +31,6 @@ def rounds(
 
     Args:
       edges: (B, 2) nodes.
-      place: (N,) not looked at.
       weight: (B,) floats; an edge costs the less, the more it weighs.
       source: (N,) bool.
 
@@ -39,7 +38,7 @@ def rounds(
       (N,) the weight of the bottleneck, infinite at sources, minus infinity where no
       way leads; and (N,) int32, which edge it is, any where the weight is infinite.
     """
-    num_nodes, num_edges = place.shape[0], edges.shape[0]
+    num_nodes, num_edges = source.shape[0], edges.shape[0]
     cost, (free, none) = _cost(weight), _bounds(weight.dtype)
     nodes = jnp.arange(num_nodes, dtype=jnp.int32)
     first, second = edges[:, 0], edges[:, 1]
@@ -97,27 +96,26 @@ def _ends(pointer: jax.Array) -> jax.Array:
 
 
 def in_tiles(
-    edges: jax.Array, place: jax.Array, weight: jax.Array, source: jax.Array
+    way: jax.Array, weight: jax.Array, source: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Search copies of one graph.
 
     Args:
-      edges: (B, 2) nodes.
-      place: (N,) see `lanes.order`.
+      way: (M,) its `lanes.order`.
       weight: (T, B) see `rounds`.
       source: (T, N) bool.
 
     Returns:
       (T, N) weights and (T, N) edges, see `rounds`.
     """
-    way = lanes.order(edges, place.shape[0], place)
+    through = lanes.unpack(way, source.shape[1], weight.shape[1])
 
     def tile(weight: jax.Array, source: jax.Array) -> tuple[jax.Array, jax.Array]:
         cost, (free, none) = _cost(weight), _bounds(weight.dtype)
-        start = jnp.where(lanes.take_rows(source, way.visit), free, none)
-        level, last = _levels(way, cost, start)
-        edge = _follow(_steps(way, cost, level, last), cost.shape[0])
-        return lanes.take_rows(level, way.turn), edge
+        start = jnp.where(lanes.take_rows(source, through.visit), free, none)
+        level, last = _levels(through, cost, start)
+        edge = _follow(_steps(through, cost, level, last), cost.shape[0])
+        return lanes.take_rows(level, through.turn), edge
 
     level, edge = lanes.tiled(tile, None, weight, source)
     return _weight(level, weight.dtype), edge.astype(jnp.int32)
@@ -157,10 +155,6 @@ def _of_hub(
     return _over_neighbours(way, side, row, lower, _row(level, row))
 
 
-LOWEST: list[Lowest] = [*map(_of_degree, lanes.DEGREES), _of_hub]
-"""By how many neighbours a row has at most; beyond that, any number."""
-
-
 def _over_neighbours(
     way: lanes.Order,
     side: jax.Array,
@@ -193,8 +187,13 @@ def _levels(
     """
     num_rows, size = level.shape
     # Row by row: groups, as for islands, would visit more than they save.
-    steps = jnp.array(lanes.DEGREES, jnp.uint32)
-    kind = jnp.sum(way.degree[..., None] > steps[None, None], axis=-1, dtype=jnp.int32)
+    steps = lanes.steps(way.near.shape[2])
+    kind = jnp.sum(
+        way.degree[..., None] > jnp.array(steps, jnp.uint32)[None, None],
+        axis=-1,
+        dtype=jnp.int32,
+    )
+    ways = [*map(_of_degree, steps), _of_hub]
     last = jnp.zeros(level.shape, _step_dtype(num_rows + cost.shape[0]))
     none = jnp.zeros((1, size), bool)
 
@@ -219,7 +218,7 @@ def _levels(
 
                 return new
 
-            found = lax.switch(kind[side, row], [*map(branch, LOWEST)], level, last)
+            found = lax.switch(kind[side, row], [*map(branch, ways)], level, last)
             # Without the barrier XLA copies all rows to write one.
             low, when, moved = lax.optimization_barrier(found)
             return _put(level, low, row), _put(last, when, row), moved

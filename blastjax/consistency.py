@@ -5,13 +5,13 @@ clamps an index out of range where numpy would raise, so whatever passes here mu
 together completely. Sizes as in `core`.
 """
 
-import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
 import jax
 import numpy as np
 
+from blastjax.author.asset import with_sweep
 from blastjax.author.descriptions import (
     Bonds,
     Chunks,
@@ -94,6 +94,18 @@ def refuse_asset(asset: Asset) -> None:
     _refuse_hierarchy(asset, host, sizes)
     _refuse_spans(host, sizes)
     _refuse_bonds(host, sizes)
+    _refuse_stale(asset)
+
+
+def _refuse_stale(asset: Asset) -> None:
+    wanted, found = with_sweep(asset).sweep, asset.sweep
+    if found is None:
+        return
+    if wanted is None or not np.array_equal(found, wanted):
+        raise ValueError(
+            "the asset's sweep is of other bonds; put None in its place where bonds or "
+            "nodes are changed"
+        )
 
 
 def refuse_state(state: State, asset: Asset | None = None) -> None:
@@ -178,18 +190,17 @@ def _shaped(
     sizes = dict(sizes or {})
     host: dict[str, np.ndarray] = {}
     kind = type(part).__name__.lower()
-    for field in dataclasses.fields(part):
-        value = getattr(part, field.name)
-        if value is None or field.metadata.get("static"):
+    for name, letters in shapes.items():
+        value = getattr(part, name)
+        if value is None:
             continue
         if isinstance(value, jax.core.Tracer):
-            raise ValueError(f"{kind}.{field.name} is traced; do this outside of jit")
-        array = host[field.name] = np.asarray(value)
-        letters = shapes[field.name]
+            raise ValueError(f"{kind}.{name} is traced; do this outside of jit")
+        array = host[name] = np.asarray(value)
         if array.ndim != len(letters):
             raise ValueError(
-                f"{kind}.{field.name} has shape {array.shape}; it has {len(letters)} "
-                "axes: of a batch, take one"
+                f"{kind}.{name} has shape {array.shape}; it has {len(letters)} axes: "
+                "of a batch, take one"
             )
         for letter, length in zip(letters, array.shape, strict=True):
             if isinstance(letter, int):
@@ -198,13 +209,13 @@ def _shaped(
                 size = sizes.setdefault(letter, length)
             if length != size:
                 raise ValueError(
-                    f"{kind}.{field.name} has shape {array.shape}; "
-                    f"its axis {letter} must have length {size}"
+                    f"{kind}.{name} has shape {array.shape}; its axis {letter} must "
+                    f"have length {size}"
                 )
-        wanted = "iu" if field.name in _INTEGERS else "f"
-        wanted = "b" if field.name in _FLAGS else wanted
+        wanted = "iu" if name in _INTEGERS else "f"
+        wanted = "b" if name in _FLAGS else wanted
         if array.dtype.kind not in wanted:
-            raise ValueError(f"{kind}.{field.name} has type {array.dtype}")
+            raise ValueError(f"{kind}.{name} has type {array.dtype}")
     return host, sizes
 
 

@@ -71,6 +71,9 @@ class Asset(pytree.Node):
     """Levels of the hierarchy below the support chunks; 0 if there are none."""
     height: int = pytree.static()
     """Levels of the hierarchy above the support chunks; 0 if there are none."""
+    sweep: jax.Array | None = None
+    """(M,) `lanes.order` of the support graph, by which batches on the CPU are swept;
+    None does without. It follows from the bonds: who changes them puts None there."""
 
 
 @pytree.dataclass

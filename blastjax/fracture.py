@@ -303,8 +303,8 @@ def split(
     chosen = old != NONE
     if actors is not None:
         chosen = chosen & actors[jnp.maximum(old, 0)]
-    across = chunks.element_values(asset, asset.chunk_centroid)[:num_nodes, 0]
-    label = graph.islands(asset.bond_nodes, state.bond_intact, num_nodes, place=across)
+    edges, way = asset.bond_nodes, asset.sweep
+    label = graph.islands(edges, state.bond_intact, num_nodes, way=way)
     label = jnp.where(chosen[:num_nodes], label, old[:num_nodes])
     actor = old.at[:num_nodes].set(label)
     state = state.replace(actor=actor, dirty=state.dirty & ~chosen[:num_nodes])

@@ -17,12 +17,16 @@ FEW = 8
 """Copies below which sweeps do not pay."""
 
 
+Kernel = Callable[..., Any]
+"""Of arrays that describe an asset, and arrays of one state of it: an array (n,)."""
+
+
 def islands(
     edges: jax.Array,
     alive: jax.Array,
     num_nodes: int,
     *,
-    place: jax.Array | None = None,
+    way: jax.Array | None = None,
 ) -> jax.Array:
     """Label every node with the smallest node that it can reach.
 
@@ -30,30 +34,35 @@ def islands(
       edges: (B, 2) nodes.
       alive: (B,) bool, the edges that connect.
       num_nodes: N.
-      place: (N,) a coordinate along which most edges are short. It changes no result,
-        only how fast batches are; None takes the numbers of the nodes.
+      way: (M,) through this graph, from `lanes.order`; None does without. It changes
+        no result, only how fast batches are.
 
     Returns:
       (N,) int32 labels. Piecewise constant: it has no derivative to speak of.
 
     One graph is solved in rounds that hook the larger root of every edge to the smaller
-    one, then halve the paths twice. A `vmap` over `alive` alone, on the CPU, sweeps
-    over all copies side by side instead (see `lanes`).
+    one, then halve the paths twice. Where there is a way, a `vmap` over `alive` alone,
+    on the CPU, sweeps over all copies side by side instead (see `lanes`).
     """
-    if edges.shape[0] == 0:
-        return jnp.arange(num_nodes, dtype=jnp.int32)
-    if place is None:
-        place = jnp.arange(num_nodes, dtype=jnp.int32)
-    if num_nodes >= lanes.LIMIT:
-        return _hook_and_jump(edges, place, alive)
-    search = one_of_many(_hook_and_jump, lanes.in_tiles, 2)
-    return search(edges, jax.lax.stop_gradient(place), alive)
+    if way is None or edges.shape[0] == 0:
+        return _hook_and_jump(edges, alive, num_nodes)
+    return _search_islands(num_nodes)(edges, way, alive)
 
 
-def _hook_and_jump(edges: jax.Array, place: jax.Array, alive: jax.Array) -> jax.Array:
-    num_nodes = place.shape[0]
+@functools.cache
+def _search_islands(num_nodes: int) -> Kernel:
+    return one_of_many(
+        lambda edges, way, alive: _hook_and_jump(edges, alive, num_nodes),
+        lambda edges, way, alive: lanes.in_tiles(num_nodes, way, alive),
+        2,
+    )
+
+
+def _hook_and_jump(edges: jax.Array, alive: jax.Array, num_nodes: int) -> jax.Array:
     first, second = edges[:, 0], edges[:, 1]
     nodes = jnp.arange(num_nodes, dtype=jnp.int32)
+    if edges.shape[0] == 0:
+        return nodes
 
     def hook(carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         label, _ = carry
@@ -66,10 +75,6 @@ def _hook_and_jump(edges: jax.Array, place: jax.Array, alive: jax.Array) -> jax.
 
     start = (nodes, jnp.array(True))
     return jax.lax.while_loop(lambda carry: carry[1], hook, start)[0]
-
-
-Kernel = Callable[..., Any]
-"""Of arrays that describe an asset, and arrays of one state of it: an array (n,)."""
 
 
 @functools.cache
@@ -218,7 +223,7 @@ def bottleneck(
     source: jax.Array,
     num_nodes: int,
     *,
-    place: jax.Array | None = None,
+    way: jax.Array | None = None,
 ) -> tuple[jax.Array, jax.Array]:
     """Find the way to a source whose weakest edge is as strong as possible.
 
@@ -227,7 +232,7 @@ def bottleneck(
       weight: (B,) strength, any sign; minus infinity or NaN if an edge leads nowhere.
       source: (N,) bool, the nodes to reach.
       num_nodes: N.
-      place: (N,) see `islands`.
+      way: see `islands`.
 
     Returns:
       (N,) weight of the weakest edge on the best way: infinite at the sources, minus
@@ -236,19 +241,35 @@ def bottleneck(
       is above t. The derivative is one for the weakest edge and zero for all others,
       exact wherever no two weights tie; of equal edges one is chosen.
 
-    One graph is solved by Boruvka's rounds. A `vmap` over weights and sources, on the
-    CPU, sweeps over all copies side by side instead (see `lanes`).
+    One graph is solved by Boruvka's rounds. Where there is a way, a `vmap` over weights
+    and sources, on the CPU, sweeps over all copies side by side instead (see `lanes`).
     """
     if edges.shape[0] == 0:
         least = jnp.where(source, jnp.inf, -jnp.inf).astype(weight.dtype)
         return least, jnp.full(num_nodes, -1, jnp.int32)
-    if place is None:
-        place = jnp.arange(num_nodes, dtype=jnp.int32)
-    search = one_of_many(bottlenecks.rounds, bottlenecks.in_tiles, 2)
     # Searches run on constants: nothing in there is differentiated.
-    least, edge = search(edges, *jax.lax.stop_gradient((place, weight)), source)
+    constant = jax.lax.stop_gradient(weight)
+    if way is None:
+        least, edge = bottlenecks.rounds(edges, constant, source)
+    else:
+        search = one_of_many(_bottleneck_rounds, _bottleneck_sweeps, 2)
+        least, edge = search(edges, way, constant, source)
     edge = jnp.where(jnp.isfinite(least), edge, -1)
     return _as_weight_of(edge, least, weight), edge
+
+
+def _bottleneck_rounds(
+    edges: jax.Array, way: jax.Array, weight: jax.Array, source: jax.Array
+) -> Any:
+    del way
+    return bottlenecks.rounds(edges, weight, source)
+
+
+def _bottleneck_sweeps(
+    edges: jax.Array, way: jax.Array, weight: jax.Array, source: jax.Array
+) -> Any:
+    del edges
+    return bottlenecks.in_tiles(way, weight, source)
 
 
 @jax.custom_jvp

@@ -10,6 +10,7 @@ of the nodes follows the way, and a few pairs of sweeps are enough.
 Nodes are visited in an order of their own; labels are node numbers all the same.
 """
 
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -24,7 +25,9 @@ LIMIT = 65535
 """Nodes from which labels no longer fit 16 bits."""
 PATIENCE = 16
 """Pairs of sweeps before a tile also jumps, now and then: most tiles never need it."""
-DEGREES = (0, 1, 2, 3, 4, 6, 8, 12, 16)
+MOST = 16
+"""Neighbours on one side that are read in one step; nodes with more are hubs."""
+DEGREES = (0, 1, 2, 3, 4, 6, 8, 12, MOST)
 """Nodes' neighbours on one side are read in one step of the next such size."""
 GROUP = 4
 """Nodes that a sweep visits at a time: a step of a loop costs as much as some rows."""
@@ -35,11 +38,14 @@ SURE = 3
 
 
 class Order(NamedTuple):
-    """The way through a graph. Rows are the nodes in the order of their visits.
+    """The way through a graph of N nodes and B edges.
 
-    Rows are visited in groups of neighbours in that order, none of which is joined to
-    another of its group. A row's neighbours are those before it, for the sweep forward
-    (0), and those behind it, for the sweep backward (1).
+    Rows are the nodes in the order of their visits. They are visited in groups of
+    neighbours in that order, none of which is joined to another of its group. A row's
+    neighbours are those before it, for the sweep forward (0), and those behind it, for
+    the sweep backward (1).
+
+    Numbers are unsigned: such an index is not checked for counting from the end.
     """
 
     visit: jax.Array
@@ -51,19 +57,19 @@ class Order(NamedTuple):
     first: jax.Array
     """(N,) by group, its first row."""
     kind: jax.Array
-    """(2, N,) by group, index into DEGREES; one beyond its end for hubs."""
+    """(2, N) by group, index into DEGREES; the one behind that of K for hubs."""
     near: jax.Array
     """(2, N + GROUP, K) by row, the first neighbours; itself where there are less."""
     by: jax.Array
     """(2, N + GROUP, K) by row, the edges to them; any where there are less."""
     start: jax.Array
-    """(2, N + GROUP,) by row, where its neighbours begin in `node`."""
+    """(2, N + GROUP) by row, where its neighbours begin in `node`."""
     degree: jax.Array
-    """(2, N + GROUP,) by row, how many it has."""
+    """(2, N + GROUP) by row, how many it has."""
     node: jax.Array
-    """(2, B,) all neighbours, one row's after the other's."""
+    """(2, B) all neighbours, one row's after the other's."""
     edge: jax.Array
-    """(2, B,) the edges to them."""
+    """(2, B) the edges to them."""
 
 
 def label_dtype(num_nodes: int) -> type[np.unsignedinteger]:
@@ -71,99 +77,128 @@ def label_dtype(num_nodes: int) -> type[np.unsignedinteger]:
     return np.uint8 if num_nodes < 255 else np.uint16
 
 
-def order(edges: jax.Array, num_nodes: int, place: jax.Array | None = None) -> Order:
-    """Prepare sweeps over a graph.
+def order(
+    edges: np.ndarray, num_nodes: int, place: np.ndarray | None = None
+) -> jax.Array | None:
+    """Prepare sweeps over a graph, on the host.
 
     Args:
-      edges: (B, 2) nodes.
+      edges: (B, 2) nodes; an edge of a node with itself is padding.
       num_nodes: N.
-      place: (N,) nodes are visited from low to high; None visits them by number.
+      place: (N,) nodes are visited from low to high; None visits them by number. It
+        changes no result, but sweeps are fewer if most edges are short along it.
+
+    Returns:
+      The way (M,), an `Order` in one array, whose size follows from N and B alone; None
+      where sweeps are not for the graph: it has no edges, or too many nodes.
     """
-    nodes = jnp.arange(num_nodes, dtype=jnp.int32)
-    visit = turn = nodes
+    edges = np.asarray(edges)
+    if len(edges) == 0 or num_nodes >= LIMIT:
+        return None
+    turn = np.arange(num_nodes)
     if place is not None:
-        visit = jnp.argsort(place).astype(jnp.int32)
-        turn = jnp.zeros_like(nodes).at[visit].set(nodes, unique_indices=True)
-    a, b = turn[edges[:, 0]], turn[edges[:, 1]]
-    early, late = jnp.minimum(a, b), jnp.maximum(a, b)
-    ways = _side(late, early, nodes), _side(early, late, nodes)
-    near, by, start, degree, node, edge = map(jnp.stack, zip(*ways, strict=True))
+        turn = _inverse(np.argsort(np.asarray(place), kind="stable"))
     # Level by level nothing else comes before its turn, but more goes into a group.
-    level = _levels(near[0, :num_nodes])
-    busy = jnp.minimum(jnp.sum(degree[:, :num_nodes], axis=0), 63)
-    rows = jnp.argsort(64 * level + busy).astype(jnp.int32)
-    to = nodes.at[rows].set(nodes, unique_indices=True)
-    tail = jnp.arange(GROUP, dtype=jnp.int32) + num_nodes
-    rows, beyond = jnp.concatenate([rows, tail]), jnp.concatenate([to, tail])
-    visit, near, node = visit[rows[:num_nodes]], beyond[near[:, rows]], to[node]
-    turn, by, start, degree = to[turn], by[:, rows], start[:, rows], degree[:, rows]
-    early, late = to[early], to[late]
-    # A pair of a node with itself is padding.
-    before = jnp.where(early < late, early, -1)
-    last = jnp.full_like(nodes, -1).at[late].max(before)
-    group = _groups(last)
-    most = jnp.zeros((2, num_nodes), jnp.int32).at[:, group].max(degree[:, :num_nodes])
-    steps = jnp.asarray(DEGREES, jnp.int32)
-    kind = jnp.sum(most[..., None] > steps[None, None], axis=-1, dtype=jnp.int32)
-    first = jnp.full_like(nodes, num_nodes).at[group].min(nodes)
-    # Unsigned, an index is not checked for counting from the end.
-    first, near, by, start, degree, node, edge = (
-        x.astype(jnp.uint32) for x in (first, near, by, start, degree, node, edge)
+    level = _levels(np.sort(turn[edges], axis=1), num_nodes)[turn]
+    real = edges[edges[:, 0] != edges[:, 1]]
+    busy = np.bincount(real.reshape(-1), minlength=num_nodes)
+    visit = np.lexsort((turn, busy, level))
+    turn = _inverse(visit)
+    early, late = np.sort(turn[edges], axis=1).T
+    group = _groups(early, late, num_nodes)
+    width = _width(num_nodes, len(edges))
+    sides = [_side(late, early, num_nodes, width), _side(early, late, num_nodes, width)]
+    near, by, start, degree, node, edge = map(np.stack, zip(*sides, strict=True))
+    most = np.zeros((2, num_nodes), int)
+    for busiest, each in zip(most, degree[:, :num_nodes], strict=True):
+        np.maximum.at(busiest, group, each)
+    kind = np.searchsorted(steps(width), most)
+    first = np.full(num_nodes, num_nodes)
+    first[: group[-1] + 1] = np.flatnonzero(np.diff(group, prepend=-1))
+    groups = group[-1:] + 1
+    found = visit, turn, groups, first, kind, near, by, start, degree, node, edge
+    return jnp.asarray(np.concatenate([x.reshape(-1) for x in found]).astype(np.uint32))
+
+
+def unpack(way: jax.Array, num_nodes: int, num_edges: int) -> Order:
+    """Return what `order` packed into one array (M,)."""
+    rows, width = num_nodes + GROUP, _width(num_nodes, num_edges)
+    shapes: dict[str, tuple[int, ...]] = dict(
+        visit=(num_nodes,),
+        turn=(num_nodes,),
+        groups=(),
+        first=(num_nodes,),
+        kind=(2, num_nodes),
+        near=(2, rows, width),
+        by=(2, rows, width),
+        start=(2, rows),
+        degree=(2, rows),
+        node=(2, num_edges),
+        edge=(2, num_edges),
     )
-    groups = group[-1] + 1
-    return Order(visit, turn, groups, first, kind, near, by, start, degree, node, edge)
+    ends = np.cumsum([math.prod(x) for x in shapes.values()])
+    parts = zip(jnp.split(way, ends[:-1]), shapes.items(), strict=True)
+    return Order(**{name: x.reshape(shape) for x, (name, shape) in parts})
 
 
-def _levels(near: jax.Array) -> jax.Array:
-    """Return how long a chain of neighbours (N, K) before it each row ends, (N,)."""
-
-    def one(row: jax.Array, level: jax.Array) -> jax.Array:
-        before = lax.dynamic_index_in_dim(near, row, keepdims=False)
-        top = jnp.max(jnp.where(before == row, -1, level[before])) + 1
-        return lax.dynamic_update_index_in_dim(level, top, row, 0)
-
-    start = jnp.zeros(near.shape[0], jnp.int32)
-    return lax.fori_loop(0, near.shape[0], one, start)
+def _width(num_nodes: int, num_edges: int) -> int:
+    """Return K of `Order`: twice what the nodes have on one side on average."""
+    return next((d for d in DEGREES[1:] if d * num_nodes >= 2 * num_edges), MOST)
 
 
-def _groups(last: jax.Array) -> jax.Array:
-    """Return the group of each row, by its last neighbour before it; (N,) each."""
-
-    def walk(
-        first: jax.Array, x: tuple[jax.Array, jax.Array]
-    ) -> tuple[jax.Array, jax.Array]:
-        row, last = x
-        begins = (last >= first) | (row - first == GROUP)
-        return jnp.where(begins, row, first), begins
-
-    rows = jnp.arange(last.shape[0], dtype=jnp.int32)
-    _, begins = lax.scan(walk, jnp.int32(0), (rows, last))
-    return jnp.cumsum(begins, dtype=jnp.int32)
+def steps(width: int) -> tuple[int, ...]:
+    """Return the numbers of neighbours that are read in one step, by K of an order."""
+    return DEGREES[: DEGREES.index(width) + 1]
 
 
-def _side(here: jax.Array, there: jax.Array, rows: jax.Array) -> tuple[jax.Array, ...]:
+def _inverse(permutation: np.ndarray) -> np.ndarray:
+    inverse = np.empty_like(permutation)
+    inverse[permutation] = np.arange(len(permutation))
+    return inverse
+
+
+def _levels(pairs: np.ndarray, num_rows: int) -> np.ndarray:
+    """Return how long a chain of neighbours before it each row ends, (N,).
+
+    Args:
+      pairs: (B, 2) rows, the earlier first; of a row with itself for padding.
+      num_rows: N.
+    """
+    pairs = pairs[pairs[:, 0] < pairs[:, 1]]
+    level = [0] * num_rows
+    for early, late in pairs[np.argsort(pairs[:, 1], kind="stable")].tolist():
+        level[late] = max(level[late], level[early] + 1)
+    return np.array(level)
+
+
+def _groups(early: np.ndarray, late: np.ndarray, num_rows: int) -> np.ndarray:
+    """Return the group of each row, (N,), by pairs of rows (B,), (B,)."""
+    last = np.full(num_rows, -1)
+    joined = early < late
+    np.maximum.at(last, late[joined], early[joined])
+    begins, first = [], 0
+    for row, before in enumerate(last.tolist()):
+        if before >= first or row - first == GROUP:
+            first = row
+        begins.append(first == row)
+    return np.cumsum(begins) - 1
+
+
+def _side(
+    here: np.ndarray, there: np.ndarray, num_rows: int, width: int
+) -> tuple[np.ndarray, ...]:
     """Return near, by, start, degree, node and edge of `Order`, of one side."""
-    num_edges = here.shape[0]
-    edge = jnp.arange(num_edges, dtype=jnp.int32)
-    # By row, and which edge of a row comes first does not matter.
-    _, edge = lax.sort((here, edge), num_keys=1, is_stable=False)
-    node = there[edge]
-    count = jnp.zeros_like(rows).at[here].add(1)
-    start = jnp.cumsum(count, dtype=jnp.int32) - count
-    slot = jnp.arange(DEGREES[-1], dtype=jnp.int32)[None]
-    there_is = slot < count[:, None]
-    entry = jnp.minimum(start[:, None] + slot, num_edges - 1)
-    near = jnp.where(there_is, node[entry], rows[:, None])
+    edge = np.flatnonzero(here != there)
+    edge = edge[np.argsort(here[edge], kind="stable")]
     # The last group reads some rows more, and nothing comes of them.
-    tail = jnp.arange(GROUP, dtype=jnp.int32) + rows.shape[0]
-    near = jnp.concatenate(
-        [near, jnp.broadcast_to(tail[:, None], (GROUP, DEGREES[-1]))]
-    )
-    by, start, count = (
-        jnp.pad(x, [(0, GROUP), *[(0, 0)] * (x.ndim - 1)])
-        for x in (edge[entry], start, count)
-    )
-    return near, by, start, count, node, edge
+    rows = np.arange(num_rows + GROUP)
+    degree = np.bincount(here[edge], minlength=len(rows))
+    start = np.cumsum(degree) - degree
+    edge = np.pad(edge, (0, len(here) - len(edge)))
+    node, slot = there[edge], np.arange(width)
+    entry = np.minimum(start[:, None] + slot, len(here) - 1)
+    near = np.where(slot < degree[:, None], node[entry], rows[:, None])
+    return near, edge[entry], start, degree, node, edge
 
 
 def islands(way: Order, alive: jax.Array) -> jax.Array:
@@ -243,17 +278,17 @@ def _sweep(
 
         return lax.fori_loop(zero, jnp.max(degree), one, _group(rows, first))
 
-    branches = [*map(of_degree, DEGREES), hub]
+    branches = [*map(of_degree, steps(way.near.shape[2])), hub]
 
     def visit(i: jax.Array, rows: jax.Array) -> jax.Array:
         i = jnp.where(side == 0, i, way.groups - 1 - i)
         first = way.first[i]
-        low = lax.switch(way.kind[side, i], branches, rows, first)
+        low = lax.switch(way.kind[side, i].astype(jnp.int32), branches, rows, first)
         # Without the barrier XLA computes the rows anew wherever they are read.
         low = lax.optimization_barrier(low)
         return lax.dynamic_update_slice(rows, low, (first, zero))
 
-    return lax.fori_loop(0, way.groups, visit, rows)
+    return lax.fori_loop(zero, way.groups, visit, rows)
 
 
 def take_rows(x: jax.Array, i: jax.Array) -> jax.Array:
@@ -313,10 +348,10 @@ def _total(rows: jax.Array) -> jax.Array:
     return lax.fori_loop(jnp.uint32(0), count, add, start).sum(axis=0)
 
 
-def in_tiles(edges: jax.Array, place: jax.Array, alive: jax.Array) -> jax.Array:
-    """Label the nodes of copies (T, B) of one graph: (T, N) int32."""
-    way = order(edges, place.shape[0], place)
-    return tiled(lambda x: islands(way, x), jnp.int32, alive)
+def in_tiles(num_nodes: int, way: jax.Array, alive: jax.Array) -> jax.Array:
+    """Label the nodes of copies (T, B) of one graph, by its `order`: (T, N) int32."""
+    through = unpack(way, num_nodes, alive.shape[1])
+    return tiled(lambda x: islands(through, x), jnp.int32, alive)
 
 
 def tiled(

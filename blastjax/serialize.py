@@ -26,6 +26,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from blastjax.author.asset import with_sweep
 from blastjax.author.mesh import Destructible, Mesh
 from blastjax.consistency import refuse_asset, refuse_meshes, refuse_state
 from blastjax.core import NONE, Asset, State
@@ -37,6 +38,8 @@ MAX_BYTES = 2**31
 
 _HEADER = "header"
 _TIME = (1980, 1, 1, 0, 0, 0)
+_DERIVED = ("sweep",)
+"""Fields of an asset that are no part of a file: they follow from the others."""
 _PARTS: dict[str, type] = {"asset": Asset, "state": State, "mesh": Mesh}
 
 
@@ -139,6 +142,8 @@ def load(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> Saved:
         _check_header(members)
         saved = _rebuilt({name: _array(name, raw) for name, raw in members.items()})
         _refuse(saved)
+        if saved.asset is not None:
+            saved = dataclasses.replace(saved, asset=with_sweep(saved.asset))
     except ValueError as error:
         raise ValueError(f"{os.fspath(path)!r}: {error}") from error
     return saved
@@ -171,7 +176,7 @@ def _fields(prefix: str, part: Any) -> dict[str, bytes]:
     return {
         f"{prefix}.{name}": _npy(np.asarray(value))
         for name, value in values.items()
-        if value is not None
+        if value is not None and name not in _DERIVED
     }
 
 
@@ -285,7 +290,7 @@ def _rebuilt(arrays: dict[str, np.ndarray]) -> Saved:
         prefix, _, field = name.partition(".")
         plain = field.removesuffix(".rows") if prefix == "mesh" else field
         known = {f.name for f in dataclasses.fields(_PARTS.get(prefix, Saved))}
-        if prefix not in _PARTS or plain not in known:
+        if prefix not in _PARTS or plain not in known or plain in _DERIVED:
             raise ValueError(
                 f"it has a field {name!r} that this version of the library does not "
                 "know: update the library"

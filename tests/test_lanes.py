@@ -9,7 +9,7 @@ import pytest
 import scipy.sparse
 from scipy.sparse import csgraph
 
-from blastjax import graph
+from blastjax import graph, lanes
 
 pytestmark = pytest.mark.usefixtures("strict")
 
@@ -37,10 +37,9 @@ def random_graph(kind, n, rng):
 
 
 @functools.cache
-def batched(n, placed):
-    def run(edges, alive, place):
-        place = place if placed else None
-        return jax.vmap(lambda x: graph.islands(edges, x, n, place=place))(alive)
+def batched(n):
+    def run(edges, alive, way):
+        return jax.vmap(lambda x: graph.islands(edges, x, n, way=way))(alive)
 
     return jax.jit(run)
 
@@ -52,8 +51,8 @@ def test_a_batch_is_scipys(kind, n, placed):
     for _ in range(10):
         edges = random_graph(kind, n, rng)
         alive = rng.random((150, len(edges))) < rng.random((150, 1)) ** 0.3
-        place = jnp.asarray(rng.random(n), jnp.float32)
-        found = batched(n, placed)(jnp.asarray(edges), jnp.asarray(alive), place)
+        way = lanes.order(edges, n, rng.random(n) if placed else None)
+        found = batched(n)(jnp.asarray(edges), jnp.asarray(alive), way)
         np.testing.assert_array_equal(found, scipys(edges, alive, n))
 
 
@@ -62,33 +61,36 @@ def two_walls():
     edges = rng.integers(0, 40, (2, 60, 2)).astype(np.int32)
     alive = rng.random((2, 16, 60)) < 0.5
     expected = np.stack([scipys(e, a, 40) for e, a in zip(edges, alive, strict=True)])
-    return jnp.asarray(edges), jnp.asarray(alive), expected
+    ways = jnp.stack([lanes.order(e, 40) for e in edges])
+    return (jnp.asarray(edges), ways), jnp.asarray(alive), expected
 
 
 def test_batches_of_batches():
-    edges, alive, expected = two_walls()
+    walls, alive, expected = two_walls()
+    first = jax.tree.map(lambda x: x[0], walls)
 
-    def islands(e, a):
-        return graph.islands(e, a, 40)
+    def islands(wall, a):
+        return graph.islands(wall[0], a, 40, way=wall[1])
 
     states = jax.vmap(islands, (None, 0))
-    both = jax.jit(jax.vmap(states))(edges, alive)
+    both = jax.jit(jax.vmap(states))(walls, alive)
     np.testing.assert_array_equal(both, expected)
     # The assets on the inner axis, the states on the outer one.
-    outer = jax.jit(jax.vmap(jax.vmap(islands), (None, 1), 1))(edges, alive)
+    outer = jax.jit(jax.vmap(jax.vmap(islands), (None, 1), 1))(walls, alive)
     np.testing.assert_array_equal(outer, expected)
-    shared = jax.jit(jax.vmap(states, (None, 0)))(edges[0], alive)
+    shared = jax.jit(jax.vmap(states, (None, 0)))(first, alive)
     np.testing.assert_array_equal(shared[0], expected[0])
-    looped = jax.lax.scan(lambda c, a: (c, states(edges[0], a)), 0, alive)[1]
+    looped = jax.lax.scan(lambda c, a: (c, states(first, a)), 0, alive)[1]
     np.testing.assert_array_equal(looped, shared)
 
 
 def test_derivatives_pass_around():
-    edges, _, _ = two_walls()
+    walls, _, _ = two_walls()
+    edges, way = jax.tree.map(lambda x: x[0], walls)
     strength = jnp.linspace(-1, 1, 16 * 60).reshape(16, 60).astype(jnp.float32)
 
     def total(x):
-        label = graph.islands(edges[0], x > 0, 40)
+        label = graph.islands(edges, x > 0, 40, way=way)
         return jnp.sum(x) * jnp.sum(label).astype(x.dtype)
 
     of_sum = jax.jit(jax.grad(lambda x: jax.vmap(total)(x).sum()))(strength)
@@ -112,10 +114,11 @@ def test_bottlenecks_of_a_batch_are_those_one_by_one(odd):
             weight[kind == i] = x
     source = rng.random((size, n)) < 0.06
     source[0] = False
+    way = lanes.order(edges, n)
     edges, weight, source = map(jnp.asarray, (edges, weight, source))
 
     def search(w, s):
-        return graph.bottleneck(edges, w, s, n)
+        return graph.bottleneck(edges, w, s, n, way=way)
 
     def total(w, s):
         least, edge = search(w, s)

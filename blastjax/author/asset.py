@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from blastjax import lanes
 from blastjax.author.descriptions import (
     Bonds,
     Chunks,
@@ -148,13 +149,22 @@ def build(
         height=int(support_depth.max(initial=0)),
     )
     return Built(
-        asset=asset,
+        asset=with_sweep(asset),
         chunk_map=chunk_map,
         bond_map=bond_map,
         support=described_support,
         coverage_exact=exact,
         dropped=dropped,
     )
+
+
+def with_sweep(asset: Asset) -> Asset:
+    """Return the asset with its way through the support graph, found anew."""
+    nodes = len(asset.span_node)
+    chunk = np.asarray(asset.element_chunk)[:nodes]
+    across = np.where(chunk >= 0, np.asarray(asset.chunk_centroid)[chunk, 0], 0)
+    way = lanes.order(np.asarray(asset.bond_nodes), nodes, across)
+    return asset.replace(sweep=way)
 
 
 def _nodes(chunks: Chunks, bonds: Bonds) -> tuple[np.ndarray, int]:

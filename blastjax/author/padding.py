@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from blastjax.author.asset import with_sweep
 from blastjax.core import NO_PARENT, NO_WORLD, NONE, Asset
 
 
@@ -102,7 +103,7 @@ def pad(asset: Asset, to: Capacity) -> Asset:
     in_spans = host.span_node[: old_nodes - host.has_world] + shift
     others = np.setdiff1d(np.arange(to.nodes), in_spans)
     span_node = np.concatenate([in_spans, others]).astype(np.int32)
-    return Asset(
+    padded = Asset(
         chunk_parent=grown(host.chunk_parent, to.chunks, NO_PARENT),
         chunk_children=grown(host.chunk_children, to.chunks),
         chunk_centroid=grown(host.chunk_centroid, to.chunks),
@@ -122,6 +123,7 @@ def pad(asset: Asset, to: Capacity) -> Asset:
         depth=to.depth,
         height=to.height,
     )
+    return with_sweep(padded)
 
 
 def stack(assets: Sequence[Asset], to: Capacity | None = None) -> Asset:

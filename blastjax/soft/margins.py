@@ -108,9 +108,8 @@ def margin(
 
 def _margin(asset: Asset, weight: jax.Array, source: jax.Array) -> jax.Array:
     num_nodes = asset.span_node.shape[0]
-    across = chunks.element_values(asset, asset.chunk_centroid)[:num_nodes, 0]
-    edges = asset.bond_nodes
-    least, _ = graph.bottleneck(edges, weight, source, num_nodes, place=across)
+    edges, way = asset.bond_nodes, asset.sweep
+    least, _ = graph.bottleneck(edges, weight, source, num_nodes, way=way)
     return least
 
 

@@ -387,6 +387,7 @@ class _Frame(pytree.Node):
     label: jax.Array  # (N,) smallest node of the piece
     floats: jax.Array  # (N,) bool, nodes of pieces that nothing holds
     length: jax.Array  # () m
+    way: jax.Array | None  # see `graph.islands`
 
 
 def _frame(structure: Structure, asset: Asset, state: State) -> _Frame:
@@ -412,7 +413,7 @@ def _frame(structure: Structure, asset: Asset, state: State) -> _Frame:
     root = jnp.where(weight > 0, jnp.sqrt(jnp.where(weight > 0, weight, 1)), 0)
     root = jnp.repeat(root.T, 3, axis=1)
 
-    label = graph.islands(asset.bond_nodes, alive, num_nodes)
+    label = graph.islands(asset.bond_nodes, alive, num_nodes, way=asset.sweep)
     held = (label == 0) & asset.has_world
     sign = _rows(alive.astype(place.dtype), structure.node_bonds) * structure.node_sign
     side = (structure.node_sign < 0).astype(jnp.int32)
@@ -432,6 +433,7 @@ def _frame(structure: Structure, asset: Asset, state: State) -> _Frame:
         label=label,
         floats=is_chunk & ~held,
         length=length,
+        way=asset.sweep,
     )
 
 
@@ -796,7 +798,7 @@ def _current_aggregates(
     planned = structure.aggregate
     inside = frame.alive & (planned[frame.first] == planned[frame.second])
     edges = jnp.stack([frame.first, frame.second], axis=1)
-    part = graph.islands(edges, inside, num_nodes)
+    part = graph.islands(edges, inside, num_nodes, way=frame.way)
     ones = jnp.ones(num_nodes, jnp.int32)
     size = graph.group_sum(ones, part, num_nodes)[part]
     # Largest part first, smallest name among equals.

@@ -114,15 +114,19 @@ def margins(name, edges, num_nodes, batch, repeats):
     """Print what best ways to a source cost, in searches for islands."""
     rng = np.random.default_rng(2)
     weight = jnp.asarray(rng.normal(0.2, 1, (batch, len(edges))), jnp.float32)
+    way = lanes.order(edges, num_nodes)
     alive, edges, source = weight > 0, jnp.asarray(edges), jnp.arange(num_nodes) == 0
 
     @jax.jit
     def islands(e, a):
-        return jax.vmap(lambda x: graph.islands(e, x, num_nodes))(a)
+        return jax.vmap(lambda x: graph.islands(e, x, num_nodes, way=way))(a)
 
     @jax.jit
     def bottleneck(e, w):
-        return jax.vmap(lambda x: graph.bottleneck(e, x, source, num_nodes))(w)
+        def one(x):
+            return graph.bottleneck(e, x, source, num_nodes, way=way)
+
+        return jax.vmap(one)(w)
 
     calls = {
         "islands": lambda: jax.block_until_ready(islands(edges, alive)),
@@ -161,29 +165,31 @@ def measure(name, place, edges, alive, cpp, repeats):
     num_nodes, batch = len(place), len(alive)
     e, a = jnp.asarray(edges), jnp.asarray(alive)
 
+    way = lanes.order(edges, num_nodes)
+
     @jax.jit
-    def ours(e, a):
-        return jax.vmap(lambda x: graph.islands(e, x, num_nodes))(a)
+    def ours(e, a, way):
+        return jax.vmap(lambda x: graph.islands(e, x, num_nodes, way=way))(a)
 
     start = time.perf_counter()
-    ours = ours.lower(e, a).compile()
+    ours = ours.lower(e, a, way).compile()
     compiled = time.perf_counter() - start
     label = np.zeros((batch, num_nodes), np.int32)
     few = alive[:24]
     calls = {
         "cpp": lambda: cpp(edges, alive, label),
-        "vmap": lambda: jax.block_until_ready(ours(e, a)),
+        "vmap": lambda: jax.block_until_ready(ours(e, a, way)),
         "scipy": lambda: scipys(edges, few, num_nodes),
     }
     if batch >= lanes.LANES:
-        way = jax.jit(lanes.order, static_argnums=1)(e, num_nodes)
         tiles = a.reshape(-1, lanes.LANES, len(edges))
         kept = jnp.array(tiles.swapaxes(1, 2))
+        through = lanes.unpack(way, num_nodes, len(edges))
         rollout = jax.jit(lambda w, x: lax.map(lambda y: lanes.islands(w, y), x))
-        calls["lanes"] = lambda: jax.block_until_ready(rollout(way, kept))
+        calls["lanes"] = lambda: jax.block_until_ready(rollout(through, kept))
         calls["lanes"]()
     times = least(calls, repeats)
-    np.testing.assert_array_equal(ours(e, a), label)
+    np.testing.assert_array_equal(ours(e, a, way), label)
     row = {"asset": name, "nodes": num_nodes, "bonds": len(edges), "batch": batch}
     for key, seconds in times.items():
         row[key] = 1e6 * seconds / (len(few) if key == "scipy" else batch)
