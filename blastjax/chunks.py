@@ -149,7 +149,7 @@ def _tree(asset: Asset) -> tuple[jax.Array, jax.Array, jax.Array]:
 
 def _small(actor: jax.Array) -> jax.Array:
     """Return labels in the smallest type that holds them: half the memory to move."""
-    fits = actor.shape[0] <= jnp.iinfo(jnp.int16).max
+    fits = actor.shape[0] - 1 <= jnp.iinfo(jnp.int16).max
     return actor.astype(jnp.int16) if fits else actor
 
 
@@ -161,8 +161,8 @@ def _owner(
     # In depth-first order a subtree is a range: it has one owner if no neighbours in
     # the range differ, which a running count of differences tells.
     label = jax.lax.optimization_barrier(actor[node])
-    differs = jnp.concatenate([jnp.zeros(1, bool), label[1:] != label[:-1]])
-    count = graph.running_count(differs)
+    differs = label[1:] != label[:-1]
+    count = jnp.pad(graph.running_count(differs), (1, 0))
     first = span[:, 0]
     last = jnp.maximum(span[:, 1] - 1, first)
     one = (span[:, 1] > first) & (count[last] == count[first])

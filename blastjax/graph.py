@@ -292,15 +292,21 @@ def running_count(flags: jax.Array) -> jax.Array:
 
     Piecewise constant: no derivative passes.
     """
-    n = flags.shape[0]
-    count = flags.astype(jnp.int16 if n <= jnp.iinfo(jnp.int16).max else jnp.int32)
-    # By doubling: few passes over all, where a scan would go entry by entry.
-    step = 1
-    while step < n:
-        before = jnp.pad(count[:-step], (step, 0))
-        count = jax.lax.optimization_barrier(count + before)
-        step *= 2
-    return count
+    fits = flags.shape[0] <= jnp.iinfo(jnp.int16).max
+    dtype = jnp.int16 if fits else jnp.int32
+
+    def add(count: jax.Array, flag: jax.Array) -> tuple[jax.Array, jax.Array]:
+        count = count + flag.astype(dtype)
+        return count, count
+
+    def walk(flags: jax.Array) -> jax.Array:
+        # On a CPU one pass, of whole rows where there are lanes.
+        return jax.lax.scan(add, jnp.zeros((), dtype), flags)[1]
+
+    def whole(flags: jax.Array) -> jax.Array:
+        return jnp.cumsum(flags, dtype=dtype)
+
+    return jax.lax.platform_dependent(flags, cpu=walk, default=whole)
 
 
 def group_sum(values: jax.Array, group: jax.Array, num_groups: int) -> jax.Array:

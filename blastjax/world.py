@@ -360,7 +360,9 @@ def impact_damage(
         hit = jnp.where(slot == NONE, 0.0, amount)
         point = bodies.to_rest(frames, jnp.maximum(slot, 0), touch.pos)
         owner = state.actor[jnp.maximum(element[geom], 0)]
-        dealt = jax.vmap(one)(point, hit, owner)
+        # Behind a barrier, or XLA turns the point anew for each bond.
+        contacts = jax.lax.optimization_barrier((point, hit, owner))
+        dealt = jax.vmap(one)(*contacts)
         total = jax.tree.map(lambda sum_, each: sum_ + each.sum(0), total, dealt)
     return total
 

@@ -193,8 +193,14 @@ def _add(a: Any, b: Any, times: jax.Array | float = 1.0) -> Any:
 
 
 def _total(terms: Any) -> jax.Array:
-    leaves = [jnp.sum(leaf) for leaf in jax.tree.leaves(terms) if leaf.size]
+    leaves = [_sum(leaf) for leaf in jax.tree.leaves(terms) if leaf.size]
     return sum(leaves[1:], leaves[0])
+
+
+def _sum(x: jax.Array) -> jax.Array:
+    # Row by row, and behind a barrier, it is all vectors until the last sum.
+    row = sum(x[1:], x[0]) if x.ndim > 1 else x
+    return jnp.sum(jax.lax.optimization_barrier(row))
 
 
 def _inner(a: Any, b: Any) -> jax.Array:
