@@ -241,10 +241,9 @@ def _apply_to_bonds(
 
 
 def _dirty(asset: Asset, state: State, removed: jax.Array) -> jax.Array:
-    if removed.shape[0] == 0:
-        return state.dirty
-    ends, both = asset.bond_nodes.T.reshape(-1), jnp.concatenate([removed, removed])
-    return state.dirty | graph.group_any(both, ends, state.dirty.shape[0])
+    nodes = state.dirty.shape[0]
+    touched = graph.touched(asset.bond_nodes, removed, nodes, way=asset.sweep)
+    return state.dirty | touched
 
 
 def apply_buffer(

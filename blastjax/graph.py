@@ -44,7 +44,9 @@ def islands(
     one, then halve the paths twice. Where there is a way, a `vmap` over `alive` alone,
     on the CPU, sweeps over all copies side by side instead (see `lanes`).
     """
-    if way is None or edges.shape[0] == 0:
+    if edges.shape[0] == 0:
+        return jnp.arange(num_nodes, dtype=jnp.int32)
+    if way is None:
         return _hook_and_jump(edges, alive, num_nodes)
     return _search_islands(num_nodes)(edges, way, alive)
 
@@ -61,8 +63,6 @@ def _search_islands(num_nodes: int) -> Kernel:
 def _hook_and_jump(edges: jax.Array, alive: jax.Array, num_nodes: int) -> jax.Array:
     first, second = edges[:, 0], edges[:, 1]
     nodes = jnp.arange(num_nodes, dtype=jnp.int32)
-    if edges.shape[0] == 0:
-        return nodes
 
     def hook(carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         label, _ = carry
@@ -318,6 +318,45 @@ def group_sum(values: jax.Array, group: jax.Array, num_groups: int) -> jax.Array
     group = jnp.where(group < 0, num_groups, group)
     zeros = jnp.zeros((num_groups, *values.shape[1:]), values.dtype)
     return zeros.at[group].add(values, mode="drop")
+
+
+def touched(
+    edges: jax.Array, flags: jax.Array, num_nodes: int, *, way: jax.Array | None = None
+) -> jax.Array:
+    """Return which nodes have an edge that is flagged, (N,) bool.
+
+    Args:
+      edges: (B, 2) nodes.
+      flags: (B,) bool.
+      num_nodes: N.
+      way: see `islands`.
+
+    Piecewise constant: no derivative passes. Of a batch without a flag it is free.
+    """
+    if way is None or edges.shape[0] == 0:
+        return _touched(edges, flags, num_nodes)
+    return _search_touched(num_nodes)(edges, way, flags)
+
+
+def _touched(edges: jax.Array, flags: jax.Array, num_nodes: int) -> jax.Array:
+    return group_any(jnp.tile(flags, 2), edges.T.reshape(-1), num_nodes)
+
+
+@functools.cache
+def _search_touched(num_nodes: int) -> Kernel:
+    def sweeps(edges: jax.Array, way: jax.Array, flags: jax.Array) -> jax.Array:
+        through = lanes.unpack(way, num_nodes, edges.shape[0])
+        return jax.lax.cond(
+            jnp.any(flags),
+            lambda: lanes.tiled(lambda x: lanes.touched(through, x), bool, flags),
+            lambda: jnp.zeros((flags.shape[0], num_nodes), bool),
+        )
+
+    def rounds(edges: jax.Array, way: jax.Array, flags: jax.Array) -> jax.Array:
+        del way
+        return _touched(edges, flags, num_nodes)
+
+    return one_of_many(rounds, sweeps, 2)
 
 
 def group_any(flags: jax.Array, group: jax.Array, num_groups: int) -> jax.Array:

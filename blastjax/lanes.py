@@ -348,6 +348,23 @@ def _total(rows: jax.Array) -> jax.Array:
     return lax.fori_loop(jnp.uint32(0), count, add, start).sum(axis=0)
 
 
+def touched(way: Order, flags: jax.Array) -> jax.Array:
+    """Return which nodes have an edge that is flagged (B, T): (N, T) bool."""
+    num_nodes, num_copies = way.visit.shape[0], flags.shape[1]
+    own = jnp.arange(GROUP, dtype=jnp.uint32)
+
+    def offer(
+        clean: jax.Array, first: jax.Array, near: jax.Array, by: jax.Array
+    ) -> jax.Array:
+        del clean
+        return (near == first + own)[:, None] | ~take_rows(flags, by)
+
+    clean = jnp.ones((num_nodes + GROUP, num_copies), bool)
+    for side in (0, 1):
+        clean = _sweep(clean, way, jnp.uint32(side), offer)
+    return take_rows(~clean, way.turn)
+
+
 def in_tiles(num_nodes: int, way: jax.Array, alive: jax.Array) -> jax.Array:
     """Label the nodes of copies (T, B) of one graph, by its `order`: (T, N) int32."""
     through = unpack(way, num_nodes, alive.shape[1])

@@ -56,6 +56,35 @@ def test_a_batch_is_scipys(kind, n, placed):
         np.testing.assert_array_equal(found, scipys(edges, alive, n))
 
 
+@pytest.mark.parametrize(("kind", "n"), [("any", 60), ("hub", 61)])
+def test_touched_nodes_are_numpys(kind, n):
+    rng = np.random.default_rng(n)
+    edges = random_graph(kind, n, rng)
+    way = lanes.order(edges, n)
+    flags = rng.random((150, len(edges))) < rng.random((150, 1)) ** 3
+    expected = np.zeros((150, n), bool)
+    for copy, edge in zip(*np.nonzero(flags), strict=True):
+        expected[copy, edges[edge]] = True
+    edges = jnp.asarray(edges)
+
+    def touched(x):
+        return graph.touched(edges, x, n, way=way)
+
+    many, none = jnp.asarray(flags), jnp.zeros(flags.shape, bool)
+    of_all = jax.jit(jax.vmap(touched))
+    np.testing.assert_array_equal(of_all(many), expected)
+    assert not of_all(none).any()
+    np.testing.assert_array_equal(jax.jit(touched)(many[7]), expected[7])
+
+
+def test_padding_is_not_on_the_way():
+    """An edge of a node with itself makes no hub of it."""
+    edges = np.array([[0, 1], [1, 2], *[[0, 0]] * 40], np.int32)
+    way = lanes.unpack(lanes.order(edges, 3), 3, len(edges))
+    assert np.asarray(way.degree).sum() == 2 * 2
+    assert lanes.order(edges[:0], 3) is None
+
+
 def two_walls():
     rng = np.random.default_rng(3)
     edges = rng.integers(0, 40, (2, 60, 2)).astype(np.int32)

@@ -245,6 +245,9 @@ TABLE = {
         jnp.float32(9.0),
         a.span_node.shape[0],
     ),
+    "graph.touched": lambda a, s, x: graph.touched(
+        a.bond_nodes, s.bond_intact, a.span_node.shape[0], way=a.sweep
+    ),
     "failure.excess": lambda a, s, x: stress.excess(
         a, s, verdict(a, s, x), s.bond_intact, LIMITS, center(a, s, x)
     ),
