@@ -227,7 +227,7 @@ def step(
     data = bodies.kinematics(scene, model, riding, data)
     data, found = contact.collide(scene, riding, model, data)
     data = engine.position_sensors(model, data)
-    data = engine.smooth_acceleration(model, data, bodies.empty_dofs(scene, riding))
+    data = bodies.accelerate(scene, model, riding, frames, data)
     data, report = rows.resolve(scene, model, data, riding, frames, found.riders)
     if scene.resting is None:
         data = engine.integrate(model, data)

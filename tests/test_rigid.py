@@ -405,13 +405,16 @@ def random_rows(rng, unknowns, count):
 
 
 def random_contacts(rng, size, count, slots, sides, users):
-    def side():
+    one = rng.integers(0, slots + 1, count)
+    other = (one + rng.integers(1, slots + 1, count)) % (slots + 1)
+
+    def side(slot):
         jacobian = jnp.asarray(rng.normal(size=(size, 6, count)))
-        return jnp.asarray(rng.integers(0, slots + 1, count), jnp.int32), jacobian
+        return jnp.asarray(slot, jnp.int32), jacobian
 
     user = jnp.asarray(rng.normal(size=(size, count, users)))
     return solver.Contacts(
-        sides=tuple(side() for _ in range(sides)),
+        sides=tuple(map(side, (one, other)[:sides])),
         user=user if users else None,
         stiffness=jnp.asarray(rng.uniform(0.5, 50.0, size=count)),
         reference=jnp.asarray(rng.normal(size=(size, count))),

@@ -9,6 +9,7 @@ elements.
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 from mujoco import mjx
 
 from blastjax import chunks, graph, pytree, spatial
@@ -156,10 +157,38 @@ def weigh(scene: Scene, bodies: Bodies) -> mjx.Model:
 def kinematics(
     scene: Scene, model: mjx.Model, bodies: Bodies, data: mjx.Data
 ) -> mjx.Data:
-    """Place every body and compute the inertia of the whole, actors included."""
+    """Place every body and set the inertia of all, actors included."""
     data = engine.kinematics(model, data)
     data = engine.set_inertia(data, scene.host.slot_body, bodies.mass, bodies.inertia)
-    return engine.factor_inertia(model, data)
+    implicit = model.opt.integrator != mujoco.mjtIntegrator.mjINT_EULER
+    if scene.users or implicit:
+        data = engine.set_inertia_matrix(model, data)
+    return data
+
+
+def accelerate(
+    scene: Scene, model: mjx.Model, bodies: Bodies, frames: Frames, data: mjx.Data
+) -> mjx.Data:
+    """Compute the acceleration without constraints, each slot's by itself."""
+    data = engine.set_smooth_force(model, data, empty_dofs(scene, bodies))
+    host, users, slots = scene.host, scene.users, scene.slots
+    force = data.qfrc_smooth
+    # A slot's origin is its centre of mass; it turns in its own axes.
+    push = data.xfrc_applied[host.slot_body]
+    back = jnp.swapaxes(frames.rotation[:slots], 1, 2)
+    torque = _times(back, push[:, 3:])
+    force = force.at[host.slot_dof].add(jnp.concatenate([push[:, :3], torque], axis=1))
+    own = force[host.slot_dof]
+    turning = _times(_inverse(bodies.inertia), own[:, 3:])
+    moving = jnp.concatenate([own[:, :3] / bodies.mass[:, None], turning], axis=1)
+    found = jnp.zeros_like(force).at[host.slot_dof].set(moving)
+    if users:
+        body = np.setdiff1d(np.flatnonzero(host.model.body_weldid), host.slot_body)
+        force = force.at[:users].add(engine.pushes(model, data, body, users))
+        inertia = engine.mass_matrix(model, data)[:users, :users]
+        factor = jax.scipy.linalg.cho_factor(inertia, lower=True)
+        found = found.at[:users].set(jax.scipy.linalg.cho_solve(factor, force[:users]))
+    return data.replace(qfrc_smooth=force, qacc_smooth=found)
 
 
 def empty_dofs(scene: Scene, bodies: Bodies) -> jax.Array:
@@ -259,6 +288,11 @@ def host_data(scene: Scene, bodies: Bodies, data: mjx.Data) -> mujoco.MjData:
     mujoco.mj_comPos(scene.host.model, out)
     mujoco.mj_camlight(scene.host.model, out)
     return out
+
+
+def _times(matrix: jax.Array, vector: jax.Array) -> jax.Array:
+    """Return products of (K, 3, 3) and (K, 3)."""
+    return jnp.sum(matrix * vector[:, None, :], axis=2)
 
 
 def _inverse(matrix: jax.Array) -> jax.Array:

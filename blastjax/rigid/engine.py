@@ -72,11 +72,10 @@ def set_inertia(
     return data.tree_replace({"_impl.cinert": cinert})
 
 
-def factor_inertia(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Compute the joint-space inertia matrix and its factor."""
+def set_inertia_matrix(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Compute the joint-space inertia matrix."""
     data = smooth.crb(model, data)
-    data = smooth.tendon_armature(model, data) if model.ntendon else data
-    return smooth.factor_m(model, data)
+    return smooth.tendon_armature(model, data) if model.ntendon else data
 
 
 def geom_pairs(model: mujoco.MjModel) -> np.ndarray:
@@ -184,7 +183,11 @@ def impedance(
 
 
 def point_jacobian(
-    model: mjx.Model, data: mjx.Data, point: jax.Array, body: jax.Array, count: int
+    model: mjx.Model,
+    data: mjx.Data,
+    point: jax.Array,
+    body: jax.Array | np.ndarray,
+    count: int,
 ) -> tuple[jax.Array, jax.Array]:
     """Return how points (n, 3) on bodies (n,) move and turn, each (n, count, 3).
 
@@ -219,16 +222,26 @@ def user_rows(model: mjx.Model, data: mjx.Data, count: int) -> solver.Rows | Non
     )
 
 
-def smooth_acceleration(
-    model: mjx.Model, data: mjx.Data, frozen: jax.Array
-) -> mjx.Data:
-    """Compute the acceleration without constraints; frozen dofs (V,) feel no bias."""
+def set_smooth_force(model: mjx.Model, data: mjx.Data, frozen: jax.Array) -> mjx.Data:
+    """Compute the forces without constraints; frozen dofs (V,) feel no bias.
+
+    What the user applies to bodies is not among them: see `pushes`.
+    """
     data = smooth.transmission(model, data)
     data = forward.fwd_velocity(model, data)
     data = sensor.sensor_vel(model, data) if model.nsensor else data
     data = forward.fwd_actuation(model, data)
-    data = data.replace(qfrc_bias=jnp.where(frozen, 0.0, data.qfrc_bias))
-    return forward.fwd_acceleration(model, data)
+    bias = jnp.where(frozen, 0.0, data.qfrc_bias)
+    force = data.qfrc_passive - bias + data.qfrc_actuator + data.qfrc_applied
+    return data.replace(qfrc_bias=bias, qfrc_smooth=force)
+
+
+def pushes(model: mjx.Model, data: mjx.Data, body: np.ndarray, count: int) -> jax.Array:
+    """Return what the user applies to bodies (n,), by the first `count` dofs."""
+    linear, angular = point_jacobian(model, data, data.xipos[body], body, count)
+    push = data.xfrc_applied[body]
+    moved = jnp.concatenate([linear, angular], axis=2)
+    return jnp.einsum("nui,ni->u", moved, push, precision="highest")
 
 
 def without_matrices(data: mjx.Data) -> mjx.Data:

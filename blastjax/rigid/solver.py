@@ -61,7 +61,8 @@ class Contacts(pytree.Node):
 
     sides: tuple[tuple[jax.Array, jax.Array], ...]
     """For each side on which a slot can be: its number (C,) int32, K for none, and
-    (D, 6, C) the motion of the contact by the slot's."""
+    (D, 6, C) the motion of the contact by the slot's. The same slot is on both sides
+    only where that is zero."""
     user: jax.Array | None
     """(D, C, U) the motion of the contact by the user's joints."""
     stiffness: jax.Array
@@ -310,28 +311,37 @@ def _coupled(problem: Problem) -> bool:
 
 
 def _hessian(problem: Problem, weight: Forces) -> jax.Array:
-    """Return J'DJ + M, (V, V): the user's joints, then the slots."""
+    """Return J'DJ + M, (V, V), the lower half: the user's joints, then the slots."""
     count, users = problem.slot_inertia.shape[-1], problem.free.user.shape[0]
     diagonal = jnp.moveaxis(_slot_blocks(problem, weight), -1, 0)
-    # One more slot takes what acts on none.
-    table = jnp.zeros((count + 1, count + 1, 6, 6), diagonal.dtype)
+    # In the matrix's own layout: turning it would cost as much as factoring it.
+    side = jnp.zeros((count, 6, count, 6), diagonal.dtype)
     mixed = jnp.zeros((users, 6, count), diagonal.dtype)
     index = jnp.arange(count)
-    table = table.at[index, index].set(diagonal)
+    side = side.at[index, :, index].set(diagonal)
     for contacts, edges in zip(problem.contacts, weight.edges, strict=True):
         if len(contacts.sides) == 2:
             (a, first), (b, second) = contacts.sides
-            block = _outer(list(first), _weigh(edges, list(second)))
-            both = jnp.zeros_like(table).at[a, b].add(jnp.moveaxis(block, -1, 0))
-            table = table + both + both.transpose(1, 0, 3, 2)
+            later = a > b
+            row, column = jnp.maximum(a, b), jnp.minimum(a, b)
+            lower = jnp.where(later, first, second)
+            upper = jnp.where(later, second, first)
+            block = _outer(list(lower), _weigh(edges, list(upper)))
+            # What acts on one slot only is out of range, and dropped.
+            block = jnp.moveaxis(block, -1, 0)
+            side = side.at[row, :, column].add(block, mode="drop")
         if contacts.user is not None:
             own = [part.T for part in contacts.user]
             for slot, jacobian in contacts.sides:
                 block = _outer(own, _weigh(edges, list(jacobian)))
                 mixed = mixed + _dot(block, _membership(slot, problem.slot_inertia).T)
-    side = table[:count, :count].transpose(0, 2, 1, 3).reshape(6 * count, 6 * count)
+    side = side.reshape(6 * count, 6 * count)
+    if not users:
+        return side
     cross = mixed.transpose(0, 2, 1).reshape(users, 6 * count)
-    return jnp.block([[_user_block(problem, weight), cross], [cross.T, side]])
+    return jnp.block(
+        [[_user_block(problem, weight), jnp.zeros_like(cross)], [cross.T, side]]
+    )
 
 
 def _flat(motion: Motion) -> jax.Array:
@@ -341,21 +351,26 @@ def _flat(motion: Motion) -> jax.Array:
 def _factor(problem: Problem, weight: Forces) -> Any:
     """Return what `_divide` needs to divide by the Hessian."""
     if _coupled(problem):
-        return jax.scipy.linalg.cho_factor(_hessian(problem, weight))[0]
+        return _lower(_hessian(problem, weight))
     user = None
     if problem.free.user.shape[0]:
-        user = jax.scipy.linalg.cho_factor(_user_block(problem, weight))[0]
+        user = _lower(_user_block(problem, weight))
     return user, _cholesky(_slot_blocks(problem, weight))
+
+
+def _lower(matrix: jax.Array) -> jax.Array:
+    # As the routine has it: the upper one would be turned twice.
+    return jax.scipy.linalg.cho_factor(matrix, lower=True)[0]
 
 
 def _divide(problem: Problem, factor: Any, right: Motion) -> Motion:
     users, count = right.user.shape[0], right.slots.shape[1]
     if _coupled(problem):
-        flat = jax.scipy.linalg.cho_solve((factor, False), _flat(right))
+        flat = jax.scipy.linalg.cho_solve((factor, True), _flat(right))
         return Motion(user=flat[:users], slots=flat[users:].reshape(count, 6).T)
     user = right.user
     if factor[0] is not None:
-        user = jax.scipy.linalg.cho_solve((factor[0], False), user)
+        user = jax.scipy.linalg.cho_solve((factor[0], True), user)
     return Motion(user=user, slots=_substitute(factor[1], right.slots))
 
 
