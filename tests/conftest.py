@@ -6,6 +6,8 @@ import pathlib
 import jax
 import pytest
 
+CORES = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else None
+"""What this process may run on, before any test module is loaded."""
 CACHE = pathlib.Path(__file__).parent.parent / ".pytest_cache" / "compiled"
 
 # Compilations are most of the cost of these tests; another run need not repeat them.

@@ -1,11 +1,14 @@
 """Which module may import which, and what importing the package costs."""
 
 import ast
+import os
 import pathlib
 import subprocess
 import sys
 
 import pytest
+
+from tests.conftest import CORES
 
 PACKAGE = pathlib.Path(__file__).parent.parent / "blastjax"
 
@@ -102,3 +105,9 @@ assert numpy.get_printoptions() == options[0], 'print options changed'
 assert dict(os.environ) == options[2], 'environment changed'
 """
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.skipif(CORES is None, reason="this system has no such call")
+def test_tests_leave_every_core_to_the_others():
+    """A benchmark that keeps to one core must not do so when it is only imported."""
+    assert os.sched_getaffinity(0) == CORES

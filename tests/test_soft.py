@@ -11,7 +11,7 @@ from blastjax import author, chunks, fracture, graph, soft
 from blastjax.author import shapes
 from blastjax.core import UNBREAKABLE, Damage
 from blastjax.soft import chance
-from tests.benchmarks.islands import least
+from tests.benchmarks.timing import least
 
 pytestmark = pytest.mark.usefixtures("strict")
 

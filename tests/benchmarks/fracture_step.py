@@ -10,12 +10,7 @@ SciPy's and NetworkX's islands; Blast's own figures were recorded elsewhere.
 
 import argparse
 import json
-import os
 import pathlib
-
-if hasattr(os, "sched_setaffinity"):
-    # Before JAX counts the cores.
-    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +21,8 @@ from scipy.sparse import csgraph
 
 from blastjax import chunks, damage, fracture
 from blastjax.author import shapes
-from tests.benchmarks.islands import least, union_find
+from tests.benchmarks.islands import union_find
+from tests.benchmarks.timing import least, one_core
 
 # Reset by memcpy, generate, apply, split: microseconds, on another machine.
 BLAST_ELSEWHERE = {64: (1.3, 2.6), 512: (12.0, 26.0), 4096: (115.0, 294.0)}
@@ -215,6 +211,7 @@ def picture(rows, path):
 
 def main(arguments=None):
     """Print the tables; write JSON and a picture where told to."""
+    one_core()
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--nodes", type=int, nargs="+", default=[64, 512, 4096, 32768])
     parser.add_argument("--batch", type=int, default=1024, help="of 512 nodes")

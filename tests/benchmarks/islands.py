@@ -7,15 +7,10 @@ a body, the least of interleaved runs, all on one core of one process.
 import argparse
 import ctypes
 import json
-import os
 import pathlib
 import subprocess
 import tempfile
 import time
-
-if hasattr(os, "sched_setaffinity"):
-    # Before JAX counts the cores.
-    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +21,7 @@ from scipy.sparse import csgraph
 from scipy.spatial import Delaunay
 
 from blastjax import graph, lanes
+from tests.benchmarks.timing import least, one_core
 
 UNION_FIND = r"""
 #include <cstdint>
@@ -149,18 +145,6 @@ def scipys(edges, alive, num_nodes):
         csgraph.connected_components(matrix, directed=False)
 
 
-def least(calls, repeats):
-    """Return the least time of each call, in rounds of all; caches warm for each."""
-    times = {name: [] for name in calls}
-    for _ in range(repeats):
-        for name, call in calls.items():
-            call()
-            start = time.perf_counter()
-            call()
-            times[name].append(time.perf_counter() - start)
-    return {name: min(x) for name, x in times.items()}
-
-
 def measure(name, place, edges, alive, cpp, repeats):
     num_nodes, batch = len(place), len(alive)
     e, a = jnp.asarray(edges), jnp.asarray(alive)
@@ -244,6 +228,7 @@ def picture(rows, path):
 
 
 def main():
+    one_core()
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--json", type=pathlib.Path)
     parser.add_argument("--picture", type=pathlib.Path)

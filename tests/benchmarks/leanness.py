@@ -8,13 +8,8 @@ carries from step to step. All on one core of one process.
 
 import argparse
 import json
-import os
 import pathlib
 import time
-
-if hasattr(os, "sched_setaffinity"):
-    # Before JAX counts the cores.
-    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +19,7 @@ from blastjax import chunks, damage, fracture, stress, world
 from blastjax.author import shapes
 from blastjax.core import Damage
 from blastjax.rigid import build
-from tests.benchmarks.islands import least
+from tests.benchmarks.timing import least, one_core
 from tests.operations import trace
 
 ARM = """
@@ -143,6 +138,7 @@ def report(title, rows):
 
 def main(arguments=None):
     """Print the tables; write JSON where told to."""
+    one_core()
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", choices=["fracture", "world"])
     parser.add_argument("--cubes", type=int, help="an edge; 8 (fracture) and 2 (world)")
