@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from blastjax.author.asset import with_sweep
+from blastjax import lanes
 from blastjax.author.descriptions import (
     Bonds,
     Chunks,
@@ -98,9 +98,15 @@ def refuse_asset(asset: Asset) -> None:
 
 
 def _refuse_stale(asset: Asset) -> None:
-    wanted, found = with_sweep(asset).sweep, asset.sweep
-    if found is None:
+    """The sweep, if there is one, leads through these bonds, in whatever order."""
+    if asset.sweep is None:
         return
+    found, nodes = np.asarray(asset.sweep), len(asset.span_node)
+    wanted = lanes.order(np.asarray(asset.bond_nodes), nodes)
+    if wanted is not None and found.shape == wanted.shape:
+        # An order by the turns of a way is that way again.
+        turn = np.asarray(lanes.unpack(asset.sweep, nodes, len(asset.bond_nodes)).turn)
+        wanted = lanes.order(np.asarray(asset.bond_nodes), nodes, turn)
     if wanted is None or not np.array_equal(found, wanted):
         raise ValueError(
             "the asset's sweep is of other bonds; put None in its place where bonds or "

@@ -10,6 +10,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from blastjax import bottlenecks, lanes
 
@@ -34,8 +35,9 @@ def islands(
       edges: (B, 2) nodes.
       alive: (B,) bool, the edges that connect.
       num_nodes: N.
-      way: (M,) through this graph, from `lanes.order`; None does without. It changes
-        no result, only how fast batches are.
+      way: (M,) through this graph, from `lanes.order`. It changes no result, only how
+        fast batches are. None finds one if the edges are known while tracing, and does
+        without if they are traced themselves.
 
     Returns:
       (N,) int32 labels. Piecewise constant: it has no derivative to speak of.
@@ -46,9 +48,17 @@ def islands(
     """
     if edges.shape[0] == 0:
         return jnp.arange(num_nodes, dtype=jnp.int32)
+    way = _way(edges, alive, num_nodes) if way is None else way
     if way is None:
         return _hook_and_jump(edges, alive, num_nodes)
     return _search_islands(num_nodes)(edges, way, alive)
+
+
+def _way(edges: jax.Array, each: jax.Array, num_nodes: int) -> jax.Array | None:
+    """Return a way through edges that are known where what is on them is traced."""
+    if isinstance(edges, jax.core.Tracer) or not isinstance(each, jax.core.Tracer):
+        return None
+    return lanes.order(np.asarray(edges), num_nodes)
 
 
 @functools.cache
@@ -249,6 +259,7 @@ def bottleneck(
         return least, jnp.full(num_nodes, -1, jnp.int32)
     # Searches run on constants: nothing in there is differentiated.
     constant = jax.lax.stop_gradient(weight)
+    way = _way(edges, weight, num_nodes) if way is None else way
     if way is None:
         least, edge = bottlenecks.rounds(edges, constant, source)
     else:
@@ -333,7 +344,8 @@ def touched(
 
     Piecewise constant: no derivative passes. Of a batch without a flag it is free.
     """
-    if way is None or edges.shape[0] == 0:
+    way = _way(edges, flags, num_nodes) if way is None else way
+    if way is None:
         return _touched(edges, flags, num_nodes)
     return _search_touched(num_nodes)(edges, way, flags)
 

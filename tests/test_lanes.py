@@ -85,6 +85,19 @@ def test_padding_is_not_on_the_way():
     assert lanes.order(edges[:0], 3) is None
 
 
+def test_a_way_is_found_where_the_edges_are_known():
+    rng = np.random.default_rng(5)
+    edges = random_graph("hub", 61, rng)
+    alive = rng.random((16, len(edges))) < 0.5
+    known = jnp.asarray(edges)
+    many = jax.vmap(lambda x: graph.islands(known, x, 61))
+    # Sweeps are for one platform only.
+    assert "platform_index" in str(jax.make_jaxpr(many)(alive))
+    np.testing.assert_array_equal(jax.jit(many)(alive), scipys(edges, alive, 61))
+    either = jax.vmap(lambda e, x: graph.islands(e, x, 61), (None, 0))
+    assert "platform_index" not in str(jax.make_jaxpr(either)(known, alive))
+
+
 def two_walls():
     rng = np.random.default_rng(3)
     edges = rng.integers(0, 40, (2, 60, 2)).astype(np.int32)

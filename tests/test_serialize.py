@@ -260,6 +260,19 @@ def test_static_facts_must_not_understate(field, value):
         refuse_asset(hierarchy().replace(**{field: value}))
 
 
+def test_the_sweep_must_be_that_of_the_bonds(tmp_path):
+    asset = hierarchy()
+    away = jnp.asarray(asset.chunk_centroid)[::-1]
+    refuse_asset(asset.replace(sweep=None))
+    # Where its chunks are changes the best way, not whether this is one.
+    refuse_asset(asset.replace(chunk_centroid=away))
+    for stale in (asset.sweep.at[0].add(1), asset.sweep[1:], asset.sweep.at[-1].add(1)):
+        with pytest.raises(ValueError, match="sweep"):
+            refuse_asset(asset.replace(sweep=stale))
+    path = serialize.save(tmp_path / "asset.npz", asset.replace(sweep=None))
+    np.testing.assert_array_equal(serialize.load(path).asset.sweep, asset.sweep)
+
+
 def test_inconsistent_states_are_refused():
     asset = padded()
     state = fracture.init(asset)

@@ -3,9 +3,10 @@
 `python -m tests.benchmarks.fracture_step [--json FILE] [--picture FILE]` prints
 microseconds a body for: reset, radial damage, apply, split, visible chunks and events,
 of distinct damage for every body of a batch, all on one core of one process, laps of
-all in turn, the least of each. The moments of the actors are timed apart. Peers in the
-same run are the islands alone in C++ (union-find), and a plain NumPy Blast around
-SciPy's and NetworkX's islands; Blast's own figures were recorded elsewhere.
+all in turn, the least of each. The moments of the actors are timed apart, and so is the
+same with `apply` and `split` in place of `step`. Peers in the same run are the islands
+alone in C++ (union-find), and a plain NumPy Blast around SciPy's and NetworkX's
+islands; Blast's own figures were recorded elsewhere.
 """
 
 import argparse
@@ -22,7 +23,7 @@ from scipy.sparse import csgraph
 from blastjax import chunks, damage, fracture
 from blastjax.author import shapes
 from tests.benchmarks.islands import union_find
-from tests.benchmarks.timing import least, one_core
+from tests.benchmarks.timing import keep_memory, least, one_core
 
 # Reset by memcpy, generate, apply, split: microseconds, on another machine.
 BLAST_ELSEWHERE = {64: (1.3, 2.6), 512: (12.0, 26.0), 4096: (115.0, 294.0)}
@@ -49,6 +50,14 @@ def generate(asset, point, radius):
 def broken(asset, point, radius):
     """Return the state and the events after damage and split."""
     return fracture.step(asset, *generate(asset, point, radius))
+
+
+def in_two(asset, point, radius):
+    """Return the same as `broken`, by a call to apply and one to split."""
+    state, dealt = generate(asset, point, radius)
+    state, fractured = fracture.apply(asset, state, dealt)
+    state, parted = fracture.split(asset, state)
+    return state, (fractured, parted)
 
 
 def round_trip(asset, point, radius):
@@ -134,7 +143,8 @@ def measure(nodes, batch, cpp, repeats):
     }
     if nodes <= SLOW:
         calls["NetworkX"] = lambda: [plain.step(*x, by_networkx) for x in few]
-    for name, part in (("generate", generate), ("+ split", broken)):
+    parts = {"generate": generate, "+ step": broken, "+ apply, split": in_two}
+    for name, part in parts.items():
         calls[name], _ = batch_of(part, asset, point, radius)
     times = least(calls, repeats)
 
@@ -171,14 +181,15 @@ def alone(nodes, cpp, repeats):
 
 
 COLUMNS = ("union-find", "round trip", "moments", "SciPy", "NetworkX")
-STAGES = ("generate", "+ split")
+STAGES = ("generate", "+ step", "+ apply, split")
 
 
 def report(row):
     """Print one row."""
 
     def number(name):
-        return f"{row[name]:11.2f}" if name in row else f"{'-':>11}"
+        size = max(len(name), 11)
+        return f"{row[name]:{size}.2f}" if name in row else f"{'-':>{size}}"
 
     ratio = [row.get(k, np.nan) / row["union-find"] for k in ("round trip", "moments")]
     low, high = BLAST_ELSEWHERE.get(row["nodes"], (np.nan, np.nan))
@@ -186,7 +197,8 @@ def report(row):
     print(
         f"{row['nodes']:6d} {row['batch']:6d}",
         *map(number, (*COLUMNS, *STAGES)),
-        f"{ratio[0]:7.2f} {ratio[1]:7.2f} {there:>10}",
+        f"{ratio[0]:7.2f} {ratio[1]:7.2f}",
+        f"{1e3 * row['round trip'] / row['nodes']:9.1f} {there:>9}",
         flush=True,
     )
 
@@ -212,6 +224,7 @@ def picture(rows, path):
 def main(arguments=None):
     """Print the tables; write JSON and a picture where told to."""
     one_core()
+    keep_memory()
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--nodes", type=int, nargs="+", default=[64, 512, 4096, 32768])
     parser.add_argument("--batch", type=int, default=1024, help="of 512 nodes")
@@ -228,7 +241,9 @@ def main(arguments=None):
     print("'Blast C++' was recorded elsewhere: reset, generate, apply, split")
     heads = [f"{x:>11}" for x in (*COLUMNS, *STAGES)]
     print(
-        f"{'nodes':>6} {'batch':>6}", *heads, f"{'ratio':>7} {'moments':>7} Blast C++"
+        f"{'nodes':>6} {'batch':>6}",
+        *heads,
+        f"{'ratio':>7} {'moments':>7} {'ns a node':>9} Blast C++",
     )
     rows = []
     for nodes in chosen.nodes:
