@@ -19,10 +19,10 @@ from blastjax.core import NONE, Damage, FractureEvents, SplitEvents, State
 from blastjax.damage import falloff
 from blastjax.rigid import bodies, contact, engine, resting, rows, solver
 from blastjax.rigid.scene import Scene
-from blastjax.stress.equilibrium import Structure
 from blastjax.stress.failure import Verdict, judge, stress_damage
 from blastjax.stress.limits import Limits
 from blastjax.stress.loads import Load, add, gravity, node_place
+from blastjax.stress.structures import Structure
 
 GRACE_STEPS = 1
 """Steps for which the pieces of one split do not collide, unless told otherwise."""

@@ -6,7 +6,7 @@ more breaks. `parity` reproduces the figures of Blast's own scheme.
 """
 
 from blastjax.stress import parity
-from blastjax.stress.equilibrium import Solution, Structure, solve, structure
+from blastjax.stress.equilibrium import Solution, solve
 from blastjax.stress.failure import (
     Collapse,
     Verdict,
@@ -34,6 +34,7 @@ from blastjax.stress.loads import (
     node_mass,
     node_place,
 )
+from blastjax.stress.structures import Structure, structure
 
 __all__ = [
     "BondStress",

@@ -13,9 +13,10 @@ import jax.numpy as jnp
 from blastjax import fracture, graph, pytree, spatial
 from blastjax.core import Asset, Damage, FractureEvents, SplitEvents, State
 from blastjax.stress import limits as material_limits
-from blastjax.stress.equilibrium import Solution, Structure, solve
+from blastjax.stress.equilibrium import Solution, solve
 from blastjax.stress.limits import BondStress, Limits
 from blastjax.stress.loads import Load, node_place
+from blastjax.stress.structures import Structure
 
 ROUNDS = 100
 """Most rounds of a collapse, unless told otherwise."""
