@@ -135,7 +135,7 @@ def collide(
     for condim in sorted(found):
         contacts = jax.tree.map(lambda *x: jnp.concatenate(x), *found[condim])
         if contacts.dist.shape[0] > limit:
-            contacts, lost = _thin(contacts, carried, model.nbody, limit)
+            contacts, lost = _thin(scene, contacts, carried, limit)
             dropped = dropped.replace(contacts=dropped.contacts + lost)
         merged.append(contacts)
     contacts = jax.tree.map(lambda *x: jnp.concatenate(x), *merged)
@@ -291,21 +291,26 @@ def _plane_box(model: mjx.Model, data: mjx.Data, pair: jax.Array) -> engine.Poin
 
 
 def _thin(
-    contacts: mjx.Contact, carried: Riders, num_bodies: int, limit: int
+    scene: Scene, contacts: mjx.Contact, carried: Riders, limit: int
 ) -> tuple[mjx.Contact, jax.Array]:
     """Keep the outline of every pair of bodies, then the deepest points."""
     depth = jax.lax.stop_gradient(contacts.includemargin - contacts.dist)
     point = jax.lax.stop_gradient(contacts.pos)
     touching = depth > 0
-    body = carried.body[contacts.geom]
-    pair = body[:, 0] * num_bodies + body[:, 1]
+    # Most bodies are chunks, and carry no geom but by a slot.
+    host = scene.host
+    own = host.geom_weld[host.geom_element < 0]
+    carriers = np.unique(np.concatenate([[0], host.slot_body, own]))
+    number = np.searchsorted(carriers, np.arange(host.model.nbody))
+    body = jnp.asarray(number, jnp.int32)[carried.body[contacts.geom]]
+    pair = body[:, 0] * len(carriers) + body[:, 1]
     along = point @ _OUTLINE.T.astype(point.dtype)
     # The deepest point counts too; a slope settles which it is on a flat face.
     deepest = depth + 1e-5 * along[:, 0]
     along = jnp.concatenate([along, -along, deepest[:, None]], axis=1)
     along = jnp.where(touching[:, None], along, -jnp.inf)
-    farthest = jnp.full((num_bodies * num_bodies, along.shape[1]), -jnp.inf)
-    farthest = farthest.astype(along.dtype).at[pair].max(along)
+    farthest = jnp.full((len(carriers) ** 2, along.shape[1]), -jnp.inf, along.dtype)
+    farthest = farthest.at[pair].max(along)
     outline = touching & jnp.any(along >= farthest[pair], axis=1)
     # Any depth is less than this in metres.
     first = jnp.where(outline, 1e6, 0.0).astype(depth.dtype)
