@@ -96,26 +96,26 @@ def _ends(pointer: jax.Array) -> jax.Array:
 
 
 def in_tiles(
-    way: jax.Array, weight: jax.Array, source: jax.Array
+    sweep: jax.Array, weight: jax.Array, source: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Search copies of one graph.
 
     Args:
-      way: (M,) its `lanes.order`.
+      sweep: (M,) its `lanes.order`.
       weight: (T, B) see `rounds`.
       source: (T, N) bool.
 
     Returns:
       (T, N) weights and (T, N) edges, see `rounds`.
     """
-    through = lanes.unpack(way, source.shape[1], weight.shape[1])
+    way = lanes.unpack(sweep, source.shape[1], weight.shape[1])
 
     def tile(weight: jax.Array, source: jax.Array) -> tuple[jax.Array, jax.Array]:
         cost, (free, none) = _cost(weight), _bounds(weight.dtype)
-        start = jnp.where(lanes.take_rows(source, through.visit), free, none)
-        level, last = _levels(through, cost, start)
-        edge = _follow(_steps(through, cost, level, last), cost.shape[0])
-        return lanes.take_rows(level, through.turn), edge
+        start = jnp.where(lanes.take_rows(source, way.visit), free, none)
+        level, last = _levels(way, cost, start)
+        edge = _follow(_steps(way, cost, level, last), cost.shape[0])
+        return lanes.take_rows(level, way.turn), edge
 
     level, edge = lanes.tiled(tile, None, weight, source)
     return _weight(level, weight.dtype), edge.astype(jnp.int32)

@@ -242,7 +242,7 @@ def _apply_to_bonds(
 
 def _dirty(asset: Asset, state: State, removed: jax.Array) -> jax.Array:
     nodes = state.dirty.shape[0]
-    touched = graph.touched(asset.bond_nodes, removed, nodes, way=asset.sweep)
+    touched = graph.touched(asset.bond_nodes, removed, nodes, sweep=asset.sweep)
     return state.dirty | touched
 
 
@@ -302,8 +302,8 @@ def split(
     chosen = old != NONE
     if actors is not None:
         chosen = chosen & actors[jnp.maximum(old, 0)]
-    edges, way = asset.bond_nodes, asset.sweep
-    label = graph.islands(edges, state.bond_intact, num_nodes, way=way)
+    edges, sweep = asset.bond_nodes, asset.sweep
+    label = graph.islands(edges, state.bond_intact, num_nodes, sweep=sweep)
     label = jnp.where(chosen[:num_nodes], label, old[:num_nodes])
     actor = old.at[:num_nodes].set(label)
     state = state.replace(actor=actor, dirty=state.dirty & ~chosen[:num_nodes])

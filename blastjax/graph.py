@@ -19,7 +19,7 @@ FEW = 8
 
 
 Kernel = Callable[..., Any]
-"""Of arrays that describe an asset, and arrays of one state of it: an array (n,)."""
+"""Of arrays that describe an asset, and arrays of one state of it."""
 
 
 def islands(
@@ -27,7 +27,7 @@ def islands(
     alive: jax.Array,
     num_nodes: int,
     *,
-    way: jax.Array | None = None,
+    sweep: jax.Array | None = None,
 ) -> jax.Array:
     """Label every node with the smallest node that it can reach.
 
@@ -35,7 +35,7 @@ def islands(
       edges: (B, 2) nodes.
       alive: (B,) bool, the edges that connect.
       num_nodes: N.
-      way: (M,) through this graph, from `lanes.order`. It changes no result, only how
+      sweep: (M,) of this graph, from `lanes.order`. It changes no result, only how
         fast batches are. None finds one if the edges are known while tracing, and does
         without if they are traced themselves.
 
@@ -43,19 +43,19 @@ def islands(
       (N,) int32 labels. Piecewise constant: it has no derivative to speak of.
 
     One graph is solved in rounds that hook the larger root of every edge to the smaller
-    one, then halve the paths twice. Where there is a way, a `vmap` over `alive` alone,
+    one, then halve the paths twice. With a sweep, a `vmap` over `alive` alone,
     on the CPU, sweeps over all copies side by side instead (see `lanes`).
     """
     if edges.shape[0] == 0:
         return jnp.arange(num_nodes, dtype=jnp.int32)
-    way = _way(edges, alive, num_nodes) if way is None else way
-    if way is None:
+    sweep = _sweep(edges, alive, num_nodes) if sweep is None else sweep
+    if sweep is None:
         return _hook_and_jump(edges, alive, num_nodes)
-    return _search_islands(num_nodes)(edges, way, alive)
+    return _search_islands(num_nodes)(edges, sweep, alive)
 
 
-def _way(edges: jax.Array, each: jax.Array, num_nodes: int) -> jax.Array | None:
-    """Return a way through edges that are known where what is on them is traced."""
+def _sweep(edges: jax.Array, each: jax.Array, num_nodes: int) -> jax.Array | None:
+    """Return a sweep of edges that are known where what is on them is traced."""
     if isinstance(edges, jax.core.Tracer) or not isinstance(each, jax.core.Tracer):
         return None
     return lanes.order(np.asarray(edges), num_nodes)
@@ -64,8 +64,8 @@ def _way(edges: jax.Array, each: jax.Array, num_nodes: int) -> jax.Array | None:
 @functools.cache
 def _search_islands(num_nodes: int) -> Kernel:
     return one_of_many(
-        lambda edges, way, alive: _hook_and_jump(edges, alive, num_nodes),
-        lambda edges, way, alive: lanes.in_tiles(num_nodes, way, alive),
+        lambda edges, sweep, alive: _hook_and_jump(edges, alive, num_nodes),
+        lambda edges, sweep, alive: lanes.in_tiles(num_nodes, sweep, alive),
         2,
     )
 
@@ -233,7 +233,7 @@ def bottleneck(
     source: jax.Array,
     num_nodes: int,
     *,
-    way: jax.Array | None = None,
+    sweep: jax.Array | None = None,
 ) -> tuple[jax.Array, jax.Array]:
     """Find the way to a source whose weakest edge is as strong as possible.
 
@@ -242,7 +242,7 @@ def bottleneck(
       weight: (B,) strength, any sign; minus infinity or NaN if an edge leads nowhere.
       source: (N,) bool, the nodes to reach.
       num_nodes: N.
-      way: see `islands`.
+      sweep: see `islands`.
 
     Returns:
       (N,) weight of the weakest edge on the best way: infinite at the sources, minus
@@ -251,7 +251,7 @@ def bottleneck(
       is above t. The derivative is one for the weakest edge and zero for all others,
       exact wherever no two weights tie; of equal edges one is chosen.
 
-    One graph is solved by Boruvka's rounds. Where there is a way, a `vmap` over weights
+    One graph is solved by Boruvka's rounds. With a sweep, a `vmap` over weights
     and sources, on the CPU, sweeps over all copies side by side instead (see `lanes`).
     """
     if edges.shape[0] == 0:
@@ -259,28 +259,28 @@ def bottleneck(
         return least, jnp.full(num_nodes, -1, jnp.int32)
     # Searches run on constants: nothing in there is differentiated.
     constant = jax.lax.stop_gradient(weight)
-    way = _way(edges, weight, num_nodes) if way is None else way
-    if way is None:
+    sweep = _sweep(edges, weight, num_nodes) if sweep is None else sweep
+    if sweep is None:
         least, edge = bottlenecks.rounds(edges, constant, source)
     else:
         search = one_of_many(_bottleneck_rounds, _bottleneck_sweeps, 2)
-        least, edge = search(edges, way, constant, source)
+        least, edge = search(edges, sweep, constant, source)
     edge = jnp.where(jnp.isfinite(least), edge, -1)
     return _as_weight_of(edge, least, weight), edge
 
 
 def _bottleneck_rounds(
-    edges: jax.Array, way: jax.Array, weight: jax.Array, source: jax.Array
+    edges: jax.Array, sweep: jax.Array, weight: jax.Array, source: jax.Array
 ) -> Any:
-    del way
+    del sweep
     return bottlenecks.rounds(edges, weight, source)
 
 
 def _bottleneck_sweeps(
-    edges: jax.Array, way: jax.Array, weight: jax.Array, source: jax.Array
+    edges: jax.Array, sweep: jax.Array, weight: jax.Array, source: jax.Array
 ) -> Any:
     del edges
-    return bottlenecks.in_tiles(way, weight, source)
+    return bottlenecks.in_tiles(sweep, weight, source)
 
 
 @jax.custom_jvp
@@ -332,40 +332,45 @@ def group_sum(values: jax.Array, group: jax.Array, num_groups: int) -> jax.Array
 
 
 def touched(
-    edges: jax.Array, flags: jax.Array, num_nodes: int, *, way: jax.Array | None = None
+    edges: jax.Array,
+    flags: jax.Array,
+    num_nodes: int,
+    *,
+    sweep: jax.Array | None = None,
 ) -> jax.Array:
-    """Return which nodes have an edge that is flagged, (N,) bool.
+    """Return which nodes have an edge to another that is flagged, (N,) bool.
 
     Args:
       edges: (B, 2) nodes.
       flags: (B,) bool.
       num_nodes: N.
-      way: see `islands`.
+      sweep: see `islands`.
 
     Piecewise constant: no derivative passes. Of a batch without a flag it is free.
     """
-    way = _way(edges, flags, num_nodes) if way is None else way
-    if way is None:
+    sweep = _sweep(edges, flags, num_nodes) if sweep is None else sweep
+    if sweep is None:
         return _touched(edges, flags, num_nodes)
-    return _search_touched(num_nodes)(edges, way, flags)
+    return _search_touched(num_nodes)(edges, sweep, flags)
 
 
 def _touched(edges: jax.Array, flags: jax.Array, num_nodes: int) -> jax.Array:
+    flags = flags & (edges[:, 0] != edges[:, 1])
     return group_any(jnp.tile(flags, 2), edges.T.reshape(-1), num_nodes)
 
 
 @functools.cache
 def _search_touched(num_nodes: int) -> Kernel:
-    def sweeps(edges: jax.Array, way: jax.Array, flags: jax.Array) -> jax.Array:
-        through = lanes.unpack(way, num_nodes, edges.shape[0])
+    def sweeps(edges: jax.Array, sweep: jax.Array, flags: jax.Array) -> jax.Array:
+        through = lanes.unpack(sweep, num_nodes, edges.shape[0])
         return jax.lax.cond(
             jnp.any(flags),
             lambda: lanes.tiled(lambda x: lanes.touched(through, x), bool, flags),
             lambda: jnp.zeros((flags.shape[0], num_nodes), bool),
         )
 
-    def rounds(edges: jax.Array, way: jax.Array, flags: jax.Array) -> jax.Array:
-        del way
+    def rounds(edges: jax.Array, sweep: jax.Array, flags: jax.Array) -> jax.Array:
+        del sweep
         return _touched(edges, flags, num_nodes)
 
     return one_of_many(rounds, sweeps, 2)

@@ -89,7 +89,7 @@ def order(
         changes no result, but sweeps are fewer if most edges are short along it.
 
     Returns:
-      The way (M,), an `Order` in one array, whose size follows from N and B alone; None
+      A sweep (M,), an `Order` in one array, whose size follows from N and B alone; None
       where sweeps are not for the graph: it has no edges, or too many nodes.
     """
     edges = np.asarray(edges)
@@ -120,7 +120,7 @@ def order(
     return jnp.asarray(np.concatenate([x.reshape(-1) for x in found]).astype(np.uint32))
 
 
-def unpack(way: jax.Array, num_nodes: int, num_edges: int) -> Order:
+def unpack(sweep: jax.Array, num_nodes: int, num_edges: int) -> Order:
     """Return what `order` packed into one array (M,)."""
     rows, width = num_nodes + GROUP, _width(num_nodes, num_edges)
     shapes: dict[str, tuple[int, ...]] = dict(
@@ -137,7 +137,7 @@ def unpack(way: jax.Array, num_nodes: int, num_edges: int) -> Order:
         edge=(2, num_edges),
     )
     ends = np.cumsum([math.prod(x) for x in shapes.values()])
-    parts = zip(jnp.split(way, ends[:-1]), shapes.items(), strict=True)
+    parts = zip(jnp.split(sweep, ends[:-1]), shapes.items(), strict=True)
     return Order(**{name: x.reshape(shape) for x, (name, shape) in parts})
 
 
@@ -349,7 +349,7 @@ def _total(rows: jax.Array) -> jax.Array:
 
 
 def touched(way: Order, flags: jax.Array) -> jax.Array:
-    """Return which nodes have an edge that is flagged (B, T): (N, T) bool."""
+    """Return which nodes have an edge that is flagged, (B, T) bool: (N, T)."""
     num_nodes, num_copies = way.visit.shape[0], flags.shape[1]
     own = jnp.arange(GROUP, dtype=jnp.uint32)
 
@@ -365,10 +365,10 @@ def touched(way: Order, flags: jax.Array) -> jax.Array:
     return take_rows(~clean, way.turn)
 
 
-def in_tiles(num_nodes: int, way: jax.Array, alive: jax.Array) -> jax.Array:
+def in_tiles(num_nodes: int, sweep: jax.Array, alive: jax.Array) -> jax.Array:
     """Label the nodes of copies (T, B) of one graph, by its `order`: (T, N) int32."""
-    through = unpack(way, num_nodes, alive.shape[1])
-    return tiled(lambda x: islands(through, x), jnp.int32, alive)
+    way = unpack(sweep, num_nodes, alive.shape[1])
+    return tiled(lambda x: islands(way, x), jnp.int32, alive)
 
 
 def tiled(

@@ -230,12 +230,13 @@ def step(
     data = bodies.accelerate(scene, model, riding, frames, data)
     data, report = rows.resolve(scene, model, data, riding, frames, found.riders)
     if scene.resting is None:
-        data = engine.integrate(model, data)
+        data = engine.integrate(model, data, scene.users)
     else:
         solved = data.qacc
         data, riding = resting.resist(scene, model, riding, frames, found.riders, data)
         # The solver's own answer is the better guess for its next one.
-        data = engine.integrate(model, data).replace(qacc_warmstart=solved)
+        data = engine.integrate(model, data, scene.users)
+        data = data.replace(qacc_warmstart=solved)
     force = contact.normal_force(data)
 
     world = world.replace(

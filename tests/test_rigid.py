@@ -539,6 +539,35 @@ def test_solver_has_forward_and_reverse_derivatives(x64, kind):
     assert abs((above - below) / (2 * h) / forward - 1) < 1e-7
 
 
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast"])
+def test_a_body_whose_inertia_lies_askew_tumbles_as_euler_says(x64, integrator):
+    """Also beside a joint of the user's that is damped implicitly."""
+    model = f"""
+    <mujoco><option integrator="{integrator}" gravity="0 0 0" timestep="0.001"/>
+      <worldbody><body pos="9 0 0"><joint axis="0 1 0" damping="1"/>
+        <geom type="box" size=".1 .2 .3"/></body></worldbody></mujoco>"""
+    inertia = np.array([[0.05, 0.02, -0.01], [0.02, 0.11, 0.03], [-0.01, 0.03, 0.09]])
+    asset = block((1, 1, 1))
+    askew = asset.replace(chunk_inertia=jnp.asarray(inertia)[None])
+    scene = build(askew, slots=1, model=model, density=1.0, chunk_contacts=False)
+    spin = np.array([1.0, 5.0, 2.0])
+    start = world.init(scene, spin=spin)
+    push = np.array([0.3, -0.2, 0.1, 0.02, 0.05, -0.04])
+    slot = scene.host.slot_body[0]
+    data = start.data.replace(xfrc_applied=start.data.xfrc_applied.at[slot].set(push))
+    data = data.replace(qvel=data.qvel.at[0].set(2.0))
+    moment, _ = jit(world.step)(scene, start.replace(data=data))
+    change = (moment.data.qvel - data.qvel) / 0.001
+    mass = float(asset.chunk_volume[0])
+    turn = np.linalg.solve(inertia, push[3:] - np.cross(spin, inertia @ spin))
+    expected = np.concatenate([push[:3] / mass, turn])
+    np.testing.assert_allclose(change[scene.host.slot_dof[0]], expected, rtol=1e-9)
+    # The joint: (I + h d) a = -d w.
+    own = mujoco.MjModel.from_xml_string(model)
+    about = own.body_inertia[1, 1]
+    np.testing.assert_allclose(change[0], -2.0 / (about + 0.001), rtol=1e-9)
+
+
 # The tie to MJX.
 
 ROBOT = """
@@ -600,12 +629,18 @@ def test_canary_robots_move_as_mjx_moves_them(x64):
 def test_canary_private_names():
     model = inspect.signature(engine.smooth.kinematics).parameters
     assert list(model) == ["m", "d"]
-    for name in ("com_pos", "crb", "factor_m", "transmission", "camlight", "tendon"):
-        assert callable(getattr(engine.smooth, name))
+    for module, names in (
+        (engine.smooth, "com_pos crb transmission camlight tendon tendon_armature"),
+        (engine.forward, "fwd_velocity fwd_actuation _advance"),
+        (engine.sensor, "sensor_pos sensor_vel sensor_acc"),
+        (engine.support, "jac full_m"),
+        (engine.derivative, "deriv_smooth_vel"),
+        (engine.constraint, "_kbi make_constraint make_efc_type make_efc_address"),
+    ):
+        for name in names.split():
+            assert callable(getattr(module, name)), name
     for name in ("_contact_groups", "_COLLISION_FUNC", "_numeric", "geom_pairs"):
         assert hasattr(engine.collision_driver, name)
-    for name in ("fwd_velocity", "fwd_actuation", "fwd_acceleration", "euler"):
-        assert callable(getattr(engine.forward, name))
 
 
 # Validation.

@@ -223,7 +223,7 @@ TABLE = {
         jnp.where(s.bond_intact, x * a.bond_area - 0.3, -jnp.inf),
         jnp.arange(a.span_node.shape[0]) == 0,
         a.span_node.shape[0],
-        way=a.sweep,
+        sweep=a.sweep,
     )[0],
     "graph.group_any": lambda a, s, x: graph.group_any(
         s.bond_intact, a.bond_nodes[:, 0], a.span_node.shape[0]
@@ -235,7 +235,7 @@ TABLE = {
         x * a.bond_area, a.bond_nodes[:, 0], a.span_node.shape[0]
     ),
     "graph.islands": lambda a, s, x: graph.islands(
-        a.bond_nodes, s.bond_intact, a.span_node.shape[0], way=a.sweep
+        a.bond_nodes, s.bond_intact, a.span_node.shape[0], sweep=a.sweep
     ),
     "graph.running_count": lambda a, s, x: graph.running_count(s.bond_intact),
     "graph.shortest_ways": lambda a, s, x: graph.shortest_ways(
@@ -246,7 +246,7 @@ TABLE = {
         a.span_node.shape[0],
     ),
     "graph.touched": lambda a, s, x: graph.touched(
-        a.bond_nodes, s.bond_intact, a.span_node.shape[0], way=a.sweep
+        a.bond_nodes, s.bond_intact, a.span_node.shape[0], sweep=a.sweep
     ),
     "failure.excess": lambda a, s, x: stress.excess(
         a, s, verdict(a, s, x), s.bond_intact, LIMITS, center(a, s, x)

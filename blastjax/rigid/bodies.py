@@ -14,7 +14,7 @@ from mujoco import mjx
 
 from blastjax import chunks, graph, pytree, spatial
 from blastjax.core import NONE, SplitEvents, State
-from blastjax.rigid import engine
+from blastjax.rigid import engine, solver
 from blastjax.rigid.scene import Scene
 
 UNMEASURED = 1e3
@@ -160,10 +160,18 @@ def kinematics(
     """Place every body and set the inertia of all, actors included."""
     data = engine.kinematics(model, data)
     data = engine.set_inertia(data, scene.host.slot_body, bodies.mass, bodies.inertia)
-    implicit = model.opt.integrator != mujoco.mjtIntegrator.mjINT_EULER
-    if scene.users or implicit:
+    if scene.users:
         data = engine.set_inertia_matrix(model, data)
     return data
+
+
+def slot_inertia(bodies: Bodies) -> jax.Array:
+    """Return the joint-space inertia of each slot, (6, 6, K)."""
+    slots, axis = len(bodies.mass), np.arange(3)
+    block = jnp.zeros((slots, 6, 6), bodies.mass.dtype)
+    block = block.at[:, axis, axis].set(bodies.mass[:, None])
+    block = block.at[:, 3:, 3:].set(bodies.inertia)
+    return jnp.moveaxis(block, 0, -1)
 
 
 def accelerate(
@@ -179,15 +187,14 @@ def accelerate(
     torque = _times(back, push[:, 3:])
     force = force.at[host.slot_dof].add(jnp.concatenate([push[:, :3], torque], axis=1))
     own = force[host.slot_dof]
-    turning = _times(_inverse(bodies.inertia), own[:, 3:])
-    moving = jnp.concatenate([own[:, :3] / bodies.mass[:, None], turning], axis=1)
+    # By a factor: an inverse of a needle's inertia would lose what turns it over.
+    moving = solver.divide_blocks(slot_inertia(bodies), own.T).T
     found = jnp.zeros_like(force).at[host.slot_dof].set(moving)
     if users:
         body = np.setdiff1d(np.flatnonzero(host.model.body_weldid), host.slot_body)
         force = force.at[:users].add(engine.pushes(model, data, body, users))
         inertia = engine.mass_matrix(model, data)[:users, :users]
-        factor = jax.scipy.linalg.cho_factor(inertia, lower=True)
-        found = found.at[:users].set(jax.scipy.linalg.cho_solve(factor, force[:users]))
+        found = found.at[:users].set(engine.divide(inertia, force[:users]))
     return data.replace(qfrc_smooth=force, qacc_smooth=found)
 
 
@@ -374,7 +381,10 @@ def _inherit(
     motion = jnp.concatenate([velocity, spin], axis=1)
     qpos, dof = scene.host.slot_qpos, scene.host.slot_dof
     # An actor that no split touched must not even be rounded.
-    moved = used & (created | (origin != jnp.arange(scene.slots)))[:, None]
+    moved = (
+        used
+        & (created | (origin != jnp.arange(scene.slots, dtype=origin.dtype)))[:, None]
+    )
     pose = jnp.where(moved, pose, data.qpos[qpos])
     motion = jnp.where(moved, motion, jnp.where(used, data.qvel[dof], 0.0))
     warm = jnp.where(moved | ~used, 0.0, data.qacc_warmstart[dof])

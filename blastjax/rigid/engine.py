@@ -18,6 +18,7 @@ from mujoco import mjx
 from mujoco.mjx._src import (
     collision_driver,
     constraint,
+    derivative,
     forward,
     sensor,
     smooth,
@@ -47,7 +48,12 @@ def kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     data = smooth.com_pos(model, data)
     if model.ncam:
         data = smooth.camlight(model, data)
-    return smooth.tendon(model, data) if model.ntendon else data
+    if not model.ntendon:
+        return data
+    found = smooth.tendon(model, data)
+    # With x64 it makes some counts wider than it was given them.
+    kept = jax.tree.map(lambda x, old: x.astype(old.dtype), found._impl, data._impl)
+    return found.replace(_impl=kept)
 
 
 def set_inertia(
@@ -331,9 +337,33 @@ def contact_force(data: mjx.Data) -> jax.Array:
     return jnp.einsum("ni,nij->nj", local, touch.frame)
 
 
-def integrate(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Advance one time step by the model's integrator."""
+def integrate(model: mjx.Model, data: mjx.Data, users: int) -> mjx.Data:
+    """Advance one time step by the model's integrator.
+
+    What damps implicitly are the first `users` joints: slots have no damping.
+    """
     data = sensor.sensor_acc(model, data) if model.nsensor else data
-    if model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER:
-        return forward.euler(model, data)
-    return forward.implicit(model, data)
+    acceleration = data.qacc
+    slope = _damping(model, data, users) if users else None
+    if slope is not None:
+        inertia = mass_matrix(model, data)[:users, :users]
+        force = (data.qfrc_smooth + data.qfrc_constraint)[:users]
+        damped = inertia - model.opt.timestep * slope
+        acceleration = acceleration.at[:users].set(divide(damped, force))
+    return forward._advance(model, data, data.act_dot, acceleration)
+
+
+def _damping(model: mjx.Model, data: mjx.Data, users: int) -> jax.Array | None:
+    """Return how the force on the user's joints changes by velocity, or None."""
+    if model.opt.integrator != mujoco.mjtIntegrator.mjINT_EULER:
+        slope = derivative.deriv_smooth_vel(model, data)
+        return None if slope is None else slope[:users, :users]
+    if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP:
+        return None
+    return -jnp.diag(model.dof_damping[:users])
+
+
+def divide(matrix: jax.Array, right: jax.Array) -> jax.Array:
+    """Solve a symmetric positive definite system."""
+    factor = jax.scipy.linalg.cho_factor(matrix, lower=True)
+    return jax.scipy.linalg.cho_solve(factor, right)

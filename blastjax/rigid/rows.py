@@ -7,12 +7,11 @@ computation chapter: impedance from depth, reference from depth and velocity.
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from mujoco import mjx
 
 from blastjax.core import NONE
 from blastjax.rigid import engine, solver
-from blastjax.rigid.bodies import Bodies, Frames
+from blastjax.rigid.bodies import Bodies, Frames, slot_inertia
 from blastjax.rigid.contact import Riders
 from blastjax.rigid.scene import Scene
 
@@ -27,16 +26,12 @@ def problem(
 ) -> solver.Problem:
     """Return the contact problem of this step."""
     users = scene.users
-    block = jnp.zeros((scene.slots, 6, 6), data.qvel.dtype)
-    axis = np.arange(3)
-    block = block.at[:, axis, axis].set(bodies.mass[:, None])
-    block = block.at[:, 3:, 3:].set(bodies.inertia)
     inertia = jnp.zeros((0, 0), data.qvel.dtype)
     if users:
         inertia = engine.mass_matrix(model, data)[:users, :users]
     return solver.Problem(
         user_inertia=inertia,
-        slot_inertia=jnp.moveaxis(block, 0, -1),
+        slot_inertia=slot_inertia(bodies),
         free=motion(scene, data.qacc_smooth),
         rows=engine.user_rows(model, data, users),
         contacts=_contacts(scene, model, data, frames, carried),

@@ -374,6 +374,11 @@ def _divide(problem: Problem, factor: Any, right: Motion) -> Motion:
     return Motion(user=user, slots=_substitute(factor[1], right.slots))
 
 
+def divide_blocks(blocks: jax.Array, right: jax.Array) -> jax.Array:
+    """Solve K systems at once: (6, 6, K) and (6, K)."""
+    return _substitute(_cholesky(blocks), right)
+
+
 def _cholesky(blocks: jax.Array) -> list[jax.Array]:
     """Factor (6, 6, K): columns of L, each (6, K), with its diagonal's inverse."""
     columns = []

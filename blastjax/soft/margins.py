@@ -108,8 +108,8 @@ def margin(
 
 def _margin(asset: Asset, weight: jax.Array, source: jax.Array) -> jax.Array:
     num_nodes = asset.span_node.shape[0]
-    edges, way = asset.bond_nodes, asset.sweep
-    least, _ = graph.bottleneck(edges, weight, source, num_nodes, way=way)
+    edges, sweep = asset.bond_nodes, asset.sweep
+    least, _ = graph.bottleneck(edges, weight, source, num_nodes, sweep=sweep)
     return least
 
 

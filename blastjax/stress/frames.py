@@ -36,7 +36,7 @@ class Frame(pytree.Node):
     label: jax.Array  # (N,) smallest node of the piece
     floats: jax.Array  # (N,) bool, nodes of pieces that nothing holds
     length: jax.Array  # () m
-    way: jax.Array | None  # see `graph.islands`
+    sweep: jax.Array | None  # see `graph.islands`
 
 
 def assemble(structure: Structure, asset: Asset, state: State) -> Frame:
@@ -63,7 +63,7 @@ def assemble(structure: Structure, asset: Asset, state: State) -> Frame:
     root = jnp.where(weight > 0, jnp.sqrt(jnp.where(weight > 0, weight, 1)), 0)
     root = jnp.repeat(root.T, 3, axis=1)
 
-    label = graph.islands(asset.bond_nodes, alive, num_nodes, way=asset.sweep)
+    label = graph.islands(asset.bond_nodes, alive, num_nodes, sweep=asset.sweep)
     held = (label == 0) & asset.has_world
     sign = rows(alive.astype(place.dtype), structure.node_bonds) * structure.node_sign
     side = (structure.node_sign < 0).astype(jnp.int32)
@@ -83,7 +83,7 @@ def assemble(structure: Structure, asset: Asset, state: State) -> Frame:
         label=label,
         floats=is_chunk & ~held,
         length=length,
-        way=asset.sweep,
+        sweep=asset.sweep,
     )
 
 

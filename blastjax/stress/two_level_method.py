@@ -209,7 +209,7 @@ def _current_aggregates(
     planned = structure.aggregate
     inside = frame.alive & (planned[frame.first] == planned[frame.second])
     edges = jnp.stack([frame.first, frame.second], axis=1)
-    part = graph.islands(edges, inside, num_nodes, way=frame.way)
+    part = graph.islands(edges, inside, num_nodes, sweep=frame.sweep)
     ones = jnp.ones(num_nodes, jnp.int32)
     size = graph.group_sum(ones, part, num_nodes)[part]
     # Largest part first, smallest name among equals.

@@ -110,17 +110,17 @@ def margins(name, edges, num_nodes, batch, repeats):
     """Print what best ways to a source cost, in searches for islands."""
     rng = np.random.default_rng(2)
     weight = jnp.asarray(rng.normal(0.2, 1, (batch, len(edges))), jnp.float32)
-    way = lanes.order(edges, num_nodes)
+    sweep = lanes.order(edges, num_nodes)
     alive, edges, source = weight > 0, jnp.asarray(edges), jnp.arange(num_nodes) == 0
 
     @jax.jit
     def islands(e, a):
-        return jax.vmap(lambda x: graph.islands(e, x, num_nodes, way=way))(a)
+        return jax.vmap(lambda x: graph.islands(e, x, num_nodes, sweep=sweep))(a)
 
     @jax.jit
     def bottleneck(e, w):
         def one(x):
-            return graph.bottleneck(e, x, source, num_nodes, way=way)
+            return graph.bottleneck(e, x, source, num_nodes, sweep=sweep)
 
         return jax.vmap(one)(w)
 
@@ -149,31 +149,31 @@ def measure(name, place, edges, alive, cpp, repeats):
     num_nodes, batch = len(place), len(alive)
     e, a = jnp.asarray(edges), jnp.asarray(alive)
 
-    way = lanes.order(edges, num_nodes)
+    sweep = lanes.order(edges, num_nodes)
 
     @jax.jit
-    def ours(e, a, way):
-        return jax.vmap(lambda x: graph.islands(e, x, num_nodes, way=way))(a)
+    def ours(e, a, sweep):
+        return jax.vmap(lambda x: graph.islands(e, x, num_nodes, sweep=sweep))(a)
 
     start = time.perf_counter()
-    ours = ours.lower(e, a, way).compile()
+    ours = ours.lower(e, a, sweep).compile()
     compiled = time.perf_counter() - start
     label = np.zeros((batch, num_nodes), np.int32)
     few = alive[:24]
     calls = {
         "cpp": lambda: cpp(edges, alive, label),
-        "vmap": lambda: jax.block_until_ready(ours(e, a, way)),
+        "vmap": lambda: jax.block_until_ready(ours(e, a, sweep)),
         "scipy": lambda: scipys(edges, few, num_nodes),
     }
     if batch >= lanes.LANES:
         tiles = a.reshape(-1, lanes.LANES, len(edges))
         kept = jnp.array(tiles.swapaxes(1, 2))
-        through = lanes.unpack(way, num_nodes, len(edges))
+        through = lanes.unpack(sweep, num_nodes, len(edges))
         rollout = jax.jit(lambda w, x: lax.map(lambda y: lanes.islands(w, y), x))
         calls["lanes"] = lambda: jax.block_until_ready(rollout(through, kept))
         calls["lanes"]()
     times = least(calls, repeats)
-    np.testing.assert_array_equal(ours(e, a, way), label)
+    np.testing.assert_array_equal(ours(e, a, sweep), label)
     row = {"asset": name, "nodes": num_nodes, "bonds": len(edges), "batch": batch}
     for key, seconds in times.items():
         row[key] = 1e6 * seconds / (len(few) if key == "scipy" else batch)
