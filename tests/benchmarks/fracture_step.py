@@ -217,7 +217,7 @@ def picture(rows, path):
     low, high = zip(*(BLAST_ELSEWHERE[n] for n in known), strict=True)
     axes.fill_between(known, low, high, alpha=0.3, label="Blast C++, elsewhere")
     axes.set(xlabel="nodes", ylabel="microseconds a body")
-    axes.legend()
+    axes.legend(loc="lower right")
     canvas.savefig(path, dpi=150)
 
 
