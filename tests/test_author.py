@@ -245,3 +245,10 @@ def test_stack_keeps_every_asset():
     mass = jax.vmap(chunks.moments, (0, 0, None))(batch, state, 1.0).mass
     # The root and the pieces weigh nothing: the nodes stand for the matter.
     np.testing.assert_allclose(mass.sum(1), [4 * 0.016, 4.0], rtol=1e-5)
+
+
+def test_an_asset_can_be_built_while_something_is_traced():
+    def volume(scale):
+        return scale * shapes.wall(2, 2).chunk_volume.sum()
+
+    np.testing.assert_allclose(jax.jit(volume)(2.0), volume(2.0))

@@ -147,9 +147,10 @@ def build(
         has_world=bool(has_world),
         depth=int(sub_depth[below].max(initial=0)),
         height=int(support_depth.max(initial=0)),
+        sweep=_sweep(nodes, node_chunk, np.asarray(chunks.centroid, dtype)),
     )
     return Built(
-        asset=with_sweep(asset),
+        asset=asset,
         chunk_map=chunk_map,
         bond_map=bond_map,
         support=described_support,
@@ -159,12 +160,18 @@ def build(
 
 
 def with_sweep(asset: Asset) -> Asset:
-    """Return the asset with its way through the support graph, found anew."""
-    nodes = len(asset.span_node)
-    chunk = np.asarray(asset.element_chunk)[:nodes]
-    across = np.where(chunk >= 0, np.asarray(asset.chunk_centroid)[chunk, 0], 0)
-    way = lanes.order(np.asarray(asset.bond_nodes), nodes, across)
-    return asset.replace(sweep=way)
+    """Return the asset with the sweep of its support graph, found anew."""
+    host: Any = jax.tree.map(np.asarray, asset)
+    chunk = host.element_chunk[: len(host.span_node)]
+    return asset.replace(sweep=_sweep(host.bond_nodes, chunk, host.chunk_centroid))
+
+
+def _sweep(
+    bonds: np.ndarray, node_chunk: np.ndarray, centroid: np.ndarray
+) -> jax.Array | None:
+    """Return the order of sweeps: along x, as the chunks of the nodes lie."""
+    across = np.where(node_chunk >= 0, centroid[node_chunk, 0], 0)
+    return lanes.order(bonds, len(node_chunk), across)
 
 
 def _nodes(chunks: Chunks, bonds: Bonds) -> tuple[np.ndarray, int]:
