@@ -17,7 +17,6 @@ from blastjax import bottlenecks, lanes
 FEW = 8
 """Copies below which sweeps do not pay."""
 
-
 Kernel = Callable[..., Any]
 """Of arrays that describe an asset, and arrays of one state of it."""
 
@@ -43,8 +42,8 @@ def islands(
       (N,) int32 labels. Piecewise constant: it has no derivative to speak of.
 
     One graph is solved in rounds that hook the larger root of every edge to the smaller
-    one, then halve the paths twice. With a sweep, a `vmap` over `alive` alone,
-    on the CPU, sweeps over all copies side by side instead (see `lanes`).
+    one, then halve the paths twice. With a sweep, a `vmap` over `alive` alone, on the
+    CPU, sweeps over all copies side by side instead (see `lanes`).
     """
     if edges.shape[0] == 0:
         return jnp.arange(num_nodes, dtype=jnp.int32)

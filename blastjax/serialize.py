@@ -1,10 +1,11 @@
 """Files of assets, of their meshes and of states.
 
 A file is a plain .npz: `numpy.load` opens it without pickle. Each field of an `Asset`
-and of a `State` is one array, `asset.<field>` or `state.<field>`; each field of the
-chunks' meshes is one array of all their rows, `mesh.<field>`, and one of how many rows
-each mesh has, `mesh.<field>.rows`. A field that is None is left out. `header` is JSON:
-the format, its version, and the SHA-256 of everything else.
+and of a `State` is one array, `asset.<field>` or `state.<field>`, but for the asset's
+sweep, which follows from its bonds and is found anew; each field of the chunks' meshes
+is one array of all their rows, `mesh.<field>`, and one of how many rows each mesh has,
+`mesh.<field>.rows`. A field that is None is left out. `header` is JSON: the format, its
+version, and the SHA-256 of everything else.
 
 Members are stored, not compressed: a file cannot ask for more memory than it has bytes.
 The checksum finds damage; what a file says is checked besides, for a checksum is no

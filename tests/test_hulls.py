@@ -431,12 +431,11 @@ def test_leaning_shards_of_a_vase_come_to_rest(dtype):
     from tests.benchmarks.hulls import DROPS, falls
 
     with jax.enable_x64(dtype == "float64"):
-        found = falls("vase", 12, 1, DROPS, seconds=6.0, resting=Resting())
+        found = falls("vase", 12, 1, DROPS, resting=Resting())
     for row in found:
         assert row["actors"] == 12
         assert row["speed"] < 1e-6
         assert row["penetration"] < 1e-3
-    # When a fall ends is chance: rounding decides which way a shard topples, and how
-    # late. What lies does not tremble.
+    # When a fall ends is chance: rounding decides which way a shard topples.
     after = [row["still_after"] - row["last_broke_at"] for row in found]
-    assert np.median(after) < 2.5
+    assert np.median(after) < 2.0 and max(after) < 3.0

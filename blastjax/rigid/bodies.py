@@ -381,10 +381,8 @@ def _inherit(
     motion = jnp.concatenate([velocity, spin], axis=1)
     qpos, dof = scene.host.slot_qpos, scene.host.slot_dof
     # An actor that no split touched must not even be rounded.
-    moved = (
-        used
-        & (created | (origin != jnp.arange(scene.slots, dtype=origin.dtype)))[:, None]
-    )
+    other = origin != jnp.arange(scene.slots, dtype=origin.dtype)
+    moved = used & (created | other)[:, None]
     pose = jnp.where(moved, pose, data.qpos[qpos])
     motion = jnp.where(moved, motion, jnp.where(used, data.qvel[dof], 0.0))
     warm = jnp.where(moved | ~used, 0.0, data.qacc_warmstart[dof])

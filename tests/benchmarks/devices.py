@@ -4,7 +4,7 @@
 body of the round trip of `fracture_step`, and a world of a step of `world_step`'s cubes
 as they fall and rest: by plain `jax.vmap` on one core and on all, which XLA shares out
 as it sees fit, and by `jax.shard_map` over as many CPU devices as there are cores. One
-process, laps of all in turn, the least of each.
+process, laps of all in turn, the least of each. It moves threads as Linux does.
 """
 
 import argparse
