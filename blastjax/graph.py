@@ -375,6 +375,22 @@ def _search_touched(num_nodes: int) -> Kernel:
     return one_of_many(rounds, sweeps, 2)
 
 
+@jax.custom_batching.custom_vmap
+def anywhere(flag: jax.Array) -> jax.Array:
+    """Return a flag (); under `vmap` whether it is set in any of the batch.
+
+    That is one flag for the whole batch, so a `cond` on it stays one: what no body
+    needs in this step is left out for all. The branches must agree where the flag of a
+    body is not set. Piecewise constant: no derivative passes.
+    """
+    return flag
+
+
+@anywhere.def_vmap
+def _(size: int, is_batched: Sequence[bool], flag: jax.Array) -> tuple[jax.Array, bool]:
+    return anywhere(jnp.any(flag)), False
+
+
 def group_any(flags: jax.Array, group: jax.Array, num_groups: int) -> jax.Array:
     """Return whether any flag (n,) of each group is set, (num_groups,) bool.
 

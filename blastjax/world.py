@@ -26,6 +26,8 @@ from blastjax.stress.structures import Structure
 
 GRACE_STEPS = 1
 """Steps for which the pieces of one split do not collide, unless told otherwise."""
+_MOTION = "qpos", "qvel", "qacc_warmstart"
+"""What a split changes in MJX's data."""
 
 
 @pytree.dataclass
@@ -342,7 +344,7 @@ def impact_damage(
     amount = excess * scene.model.opt.timestep / impact.hardness
     bond_owner = state.actor[asset.bond_nodes[:, 0]]
     element = jnp.asarray(scene.host.geom_element, jnp.int32)
-    total = Damage(
+    nothing = Damage(
         bond=jnp.zeros_like(state.bond_health), chunk=jnp.zeros_like(state.chunk_health)
     )
 
@@ -355,17 +357,23 @@ def impact_damage(
             lambda mine, health: jnp.where(mine, health, 0), Damage(*own), dealt
         )
 
-    for side in scene.host.chunk_sides:
-        geom = touch.geom[:, side]
-        slot = carried.slot[geom]
-        hit = jnp.where(slot == NONE, 0.0, amount)
-        point = bodies.to_rest(frames, jnp.maximum(slot, 0), touch.pos)
-        owner = state.actor[jnp.maximum(element[geom], 0)]
-        # Behind a barrier, or XLA turns the point anew for each bond.
-        contacts = jax.lax.optimization_barrier((point, hit, owner))
-        dealt = jax.vmap(one)(*contacts)
-        total = jax.tree.map(lambda sum_, each: sum_ + each.sum(0), total, dealt)
-    return total
+    def all_of_them() -> Damage:
+        total = nothing
+        for side in scene.host.chunk_sides:
+            geom = touch.geom[:, side]
+            slot = carried.slot[geom]
+            hit = jnp.where(slot == NONE, 0.0, amount)
+            point = bodies.to_rest(frames, jnp.maximum(slot, 0), touch.pos)
+            owner = state.actor[jnp.maximum(element[geom], 0)]
+            # Behind a barrier, or XLA turns the point anew for each bond.
+            contacts = jax.lax.optimization_barrier((point, hit, owner))
+            dealt = jax.vmap(one)(*contacts)
+            total = jax.tree.map(lambda sum_, each: sum_ + each.sum(0), total, dealt)
+        return total
+
+    # Most steps see no contact that hurts.
+    hurts = graph.anywhere(jnp.any(amount > 0))
+    return jax.lax.cond(hurts, all_of_them, lambda: nothing)
 
 
 def bear(
@@ -472,9 +480,17 @@ def _regroup(
         gone = gone | light
     if remove_dead or crowded:
         debris = _swept(scene, debris, before, gone)
-    riding, data = bodies.reassign(
-        scene, world.bodies, world.data, state, parted, grace_steps
-    )
+
+    def anew(riding: bodies.Bodies, *motion: jax.Array) -> Any:
+        data = world.data.replace(**dict(zip(_MOTION, motion, strict=True)))
+        riding, data = bodies.reassign(scene, riding, data, state, parted, grace_steps)
+        return riding, *(getattr(data, name) for name in _MOTION)
+
+    # Most steps see nothing come apart.
+    parts = graph.anywhere(jnp.any(parted.created) | jnp.any(gone))
+    before = world.bodies, *(getattr(world.data, name) for name in _MOTION)
+    riding, *motion = jax.lax.cond(parts, anew, lambda *same: same, *before)
+    data = world.data.replace(**dict(zip(_MOTION, motion, strict=True)))
     world = world.replace(state=state, bodies=riding, data=data, debris=debris)
     return world, gone
 
