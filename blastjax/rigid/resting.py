@@ -77,12 +77,16 @@ def resist(
     pull = data.qfrc_constraint.at[dof].add(-lost * momentum / timestep)
     slowed = data.qacc.at[dof].add(-lost * velocity / timestep)
 
-    way = way + timestep * jax.lax.stop_gradient((1.0 - lost) * velocity)
-    far = jnp.sum(_momentum(bodies, way) * way, axis=1) / bodies.mass
-    away = far > (resting.speed * resting.delay) ** 2
+    # From rest, what slides comes half as far as by its last speed, what creeps as far.
+    left = jax.lax.stop_gradient((1.0 - lost) * velocity)
+    way, calm = way + timestep * left, calm + timestep
+    last = jnp.minimum(calm, resting.delay) * _pace(bodies, left)
+    far = _pace(bodies, way)
+    far = jnp.maximum(far, jnp.minimum(2.0 * far, last))
+    away = far > resting.speed * resting.delay
     bodies = bodies.replace(
         way=jnp.where(away[:, None], 0.0, way),
-        calm=jnp.where(away, 0.0, calm + timestep),
+        calm=jnp.where(away, 0.0, calm),
     )
     return data.replace(qacc=slowed, qfrc_constraint=pull), bodies
 
@@ -124,6 +128,12 @@ def _parting(
         moving = velocity[slot, :3] + jnp.cross(spin, arm)
         total = total + sign * spatial.dot(moving, touch.frame[:, 0])
     return jax.lax.stop_gradient(total)
+
+
+def _pace(bodies: Bodies, motion: jax.Array) -> jax.Array:
+    """Return the speed, (K,) m/s, that is the kinetic energy's of a motion (K, 6)."""
+    square = jnp.sum(_momentum(bodies, motion) * motion, axis=1) / bodies.mass
+    return jnp.sqrt(jax.lax.stop_gradient(square))
 
 
 def _momentum(bodies: Bodies, velocity: jax.Array) -> jax.Array:

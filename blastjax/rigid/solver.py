@@ -16,13 +16,14 @@ are no contacts, C contacts of D dimensions.
 """
 
 import functools
+import itertools
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from blastjax import pytree
+from blastjax import graph, pytree
 
 
 @pytree.dataclass
@@ -348,30 +349,48 @@ def _flat(motion: Motion) -> jax.Array:
     return jnp.concatenate([motion.user, motion.slots.T.reshape(-1)])
 
 
-def _factor(problem: Problem, weight: Forces) -> Any:
-    """Return what `_divide` needs to divide by the Hessian."""
-    if _coupled(problem):
-        return _lower(_hessian(problem, weight))
-    user = None
-    if problem.free.user.shape[0]:
-        user = _lower(_user_block(problem, weight))
-    return user, _cholesky(_slot_blocks(problem, weight))
+def _divide(problem: Problem, weight: Forces, right: Motion) -> Motion:
+    """Divide by the Hessian J'DJ + M."""
+    if not _coupled(problem):
+        return _divide_apart(problem, weight, right)
+    # What could couple the slots does not in most steps: nothing of it pushes.
+    couples = graph.anywhere(_couples(problem, weight))
+    return jax.lax.cond(
+        couples, _divide_together, _divide_apart, problem, weight, right
+    )
+
+
+def _couples(problem: Problem, weight: Forces) -> jax.Array:
+    """Return whether a contact with weight acts on two of what moves, () bool."""
+    count, found = problem.slot_inertia.shape[-1], []
+    for contacts, edges in zip(problem.contacts, weight.edges, strict=True):
+        acts = [slot < count for slot, _ in contacts.sides]
+        if contacts.user is not None:
+            acts.append(jnp.any(contacts.user != 0, axis=(0, 2)))
+        for a, b in itertools.combinations(acts, 2):
+            found.append(jnp.any(a & b & jnp.any(edges > 0, axis=0)))
+    return functools.reduce(jnp.logical_or, found)
+
+
+def _divide_together(problem: Problem, weight: Forces, right: Motion) -> Motion:
+    users, count = right.user.shape[0], right.slots.shape[1]
+    factor = _lower(_hessian(problem, weight))
+    flat = jax.scipy.linalg.cho_solve((factor, True), _flat(right))
+    return Motion(user=flat[:users], slots=flat[users:].reshape(count, 6).T)
+
+
+def _divide_apart(problem: Problem, weight: Forces, right: Motion) -> Motion:
+    user = right.user
+    if user.shape[0]:
+        factor = _lower(_user_block(problem, weight))
+        user = jax.scipy.linalg.cho_solve((factor, True), user)
+    blocks = _slot_blocks(problem, weight)
+    return Motion(user=user, slots=divide_blocks(blocks, right.slots))
 
 
 def _lower(matrix: jax.Array) -> jax.Array:
     # As the routine has it: the upper one would be turned twice.
     return jax.scipy.linalg.cho_factor(matrix, lower=True)[0]
-
-
-def _divide(problem: Problem, factor: Any, right: Motion) -> Motion:
-    users, count = right.user.shape[0], right.slots.shape[1]
-    if _coupled(problem):
-        flat = jax.scipy.linalg.cho_solve((factor, True), _flat(right))
-        return Motion(user=flat[:users], slots=flat[users:].reshape(count, 6).T)
-    user = right.user
-    if factor[0] is not None:
-        user = jax.scipy.linalg.cho_solve((factor[0], True), user)
-    return Motion(user=user, slots=_substitute(factor[1], right.slots))
 
 
 def divide_blocks(blocks: jax.Array, right: jax.Array) -> jax.Array:
@@ -486,7 +505,7 @@ def _newton(
     def body(carry: Any) -> Any:
         a, slack, value, grad, count, _ = carry
         weight = _curvature(problem, slack)
-        step = _divide(problem, _factor(problem, weight), grad)
+        step = _divide(problem, weight, grad)
         step = jax.tree.map(jnp.negative, step)
         along = apply_jacobian(problem, step)
         pushed = apply_inertia(problem, step)
@@ -581,7 +600,6 @@ def _minimize_jvp(
         return _add(held, apply_transpose(problem, forces))
 
     weight = _curvature(problem, _slack(problem, a))
-    factor = _factor(problem, weight)
 
     def hessian_times(v: Motion) -> Motion:
         rows, contacts = apply_jacobian(problem, v)
@@ -597,7 +615,7 @@ def _minimize_jvp(
     tangent = jax.lax.custom_linear_solve(
         hessian_times,
         jax.tree.map(jnp.negative, change),
-        solve=lambda _, right: _divide(problem, factor, right),
+        solve=lambda _, right: _divide(problem, weight, right),
         symmetric=True,
     )
     return (a, count), (tangent, np.zeros((), jax.dtypes.float0))
