@@ -71,24 +71,21 @@ def box_box(model: mjx.Model, data: mjx.Data, pair: jax.Array) -> engine.Points:
     chosen = _once(_choose(*jax.lax.stop_gradient((a, b))))
 
     own, other = _once(_where(chosen.swap, (b, a), (a, b)))
-    distance, points, outward = _face_contacts(own, other, chosen.axis, margin)
-    normal = tuple(jnp.where(chosen.swap, -x, x) for x in outward)
-    by_edges = _prefers_edges(a, b, chosen, jax.lax.stop_gradient(distance))
+    distance, point, outward = _face_contacts(own, other, chosen.axis, margin)
     gap, place, across = _edge_contact(a, b, chosen.edges)
-    none = jnp.full_like(gap, FAR)
-    distance = _where(by_edges, (gap, none, none, none), distance)
-    points = _where(by_edges, (place,) * POINTS, points)
-    frame = _frame(_where(by_edges, across, normal))
-
-    distance, points, frame = _once((distance, points, frame))
-    # From pairs last to pairs first.
-    return (
-        jnp.stack(distance).T.reshape(-1),
-        jnp.stack([jnp.stack(p) for p in points]).transpose(2, 0, 1).reshape(-1, 3),
-        jnp.repeat(
-            jnp.stack([jnp.stack(f) for f in frame]).transpose(2, 0, 1), POINTS, axis=0
-        ),
-    )
+    single = jnp.full_like(distance, FAR).at[0].set(gap)
+    by_edges = _prefers_edges(a, b, chosen, jax.lax.stop_gradient(distance))
+    distance = jnp.where(by_edges, single, distance)
+    point = jnp.where(by_edges, place[:, None], point)
+    normal = jnp.where(by_edges, across, jnp.where(chosen.swap, -outward, outward))
+    frame = [x for axis in _frame(tuple(normal)) for x in axis]
+    parts = _once((*distance, *point.reshape(-1, len(pair)), *frame))
+    # From pairs last to pairs first, in one go.
+    table = jnp.stack(parts).T
+    distance, point, frame = jnp.split(table, [POINTS, 4 * POINTS], axis=1)
+    point = point.reshape(-1, 3, POINTS).transpose(0, 2, 1).reshape(-1, 3)
+    frame = jnp.repeat(frame.reshape(-1, 3, 3), POINTS, axis=0)
+    return distance.reshape(-1), point, frame
 
 
 def _box(model: mjx.Model, data: mjx.Data, geom: jax.Array) -> _Box:
@@ -116,23 +113,10 @@ def _first(three: Any, chosen: jax.Array) -> Any:
     return _where(chosen == 0, (x, y, z), later)
 
 
-def _best(scores: Any, entries: Any) -> tuple[jax.Array, Any]:
-    """Return the greatest of the scores (P,), and its entry; the first of equal ones.
-
-    The scores are constant.
-    """
-    best, entry = scores[0], entries[0]
-    for score, other in zip(scores[1:], entries[1:], strict=True):
-        better = score > best
-        best, entry = jnp.where(better, score, best), _where(better, other, entry)
-    return best, entry
-
-
-def _pick(entries, number):
-    found = entries[0]
-    for k, entry in enumerate(entries[1:], 1):
-        found = _where(number == k, entry, found)
-    return found
+def _best(scores: Any) -> tuple[jax.Array, jax.Array]:
+    """Return the greatest of scores (P,), and which it is; the first of equal ones."""
+    stack = jnp.stack(_once(scores))
+    return jnp.max(stack, axis=0), jnp.argmax(stack, axis=0)
 
 
 def _dot(a: Vector, b: Vector) -> jax.Array:
@@ -172,8 +156,7 @@ def _choose(first: _Box, second: _Box) -> _Choice:
         gap = abs(_dot(cosine, shift)) - b[j] - _dot(leans, a)
         # Between equal faces the first box's is taken, whatever the rounding.
         gaps.append(gap - _ROUNDING * size)
-    numbers = [jnp.full(size.shape, k, jnp.int32) for k in range(9)]
-    face_gap, face = _best(gaps, numbers[:6])
+    face_gap, face = _best(gaps)
 
     # Close to parallel, rounding is most of what is left of a gap.
     rounding = 4 * jnp.finfo(size.dtype).eps * size
@@ -189,7 +172,7 @@ def _choose(first: _Box, second: _Box) -> _Choice:
         scale = jax.lax.rsqrt(jnp.where(able, square, 1.0))
         gap = (abs(shift[i2] * x - shift[i1] * y) - reach) * scale
         gaps.append(jnp.where(able, gap, -jnp.inf))
-    edge_gap, edge = _best(gaps, numbers)
+    edge_gap, edge = _best(gaps)
     return _Choice(
         swap=face > 2,
         axis=jnp.where(face > 2, face - 3, face),
@@ -199,9 +182,7 @@ def _choose(first: _Box, second: _Box) -> _Choice:
     )
 
 
-def _prefers_edges(
-    a: _Box, b: _Box, chosen: _Choice, distance: tuple[jax.Array, ...]
-) -> jax.Array:
+def _prefers_edges(a: _Box, b: _Box, chosen: _Choice, distance: jax.Array) -> jax.Array:
     """Return where (P,) edges are clearly shallower than faces, by the rule of hulls.
 
     Than the axis of the face, and than all points in which the faces meet: these may be
@@ -211,14 +192,14 @@ def _prefers_edges(
     slack, slop = _ROUNDING * (long_a + long_b), FACE_SLOP * jnp.minimum(long_a, long_b)
     edge, face = chosen.edge_gap, chosen.face_gap
     crossing = edge * jnp.where(edge < 0, 1 / FACE_BIAS, FACE_BIAS)
-    deepest = functools.reduce(jnp.minimum, distance)
+    deepest = jnp.min(distance, axis=0)
     clearly = (crossing > deepest + slack) | (edge > face + slop)
     return (crossing > face + slack) & clearly
 
 
 def _face_contacts(
     own: _Box, other: _Box, axis: jax.Array, margin: jax.Array
-) -> tuple[tuple[jax.Array, ...], tuple[Vector, ...], Vector]:
+) -> engine.Points:
     """Collide the face of a box across one of its axes (P,) with another box.
 
     Candidates are the edges of the face that looks most against it, cut off at its
@@ -226,7 +207,7 @@ def _face_contacts(
     margin (P,), the other box's lowest corner.
 
     Returns:
-      Four distances, four points and the outward normal.
+      Distances (4, P), points (3, 4, P) and the outward normal (3, P).
     """
     turn, shift = _seen(own, other)
     # The normal first, then two directions across.
@@ -235,7 +216,7 @@ def _face_contacts(
     turn, shift, half, frame = _once((turn, shift, half, frame))
     side = _sign(shift[0])
     heights = [jax.lax.stop_gradient(abs(x)) for x in turn[0]]
-    _, facing = _best(heights, [jnp.full(side.shape, k, jnp.int32) for k in range(3)])
+    _, facing = _best(heights)
     # From the other's centre to its lowest corner.
     arms = []
     for cosine, length in zip(zip(*turn, strict=True), other.half, strict=True):
@@ -245,111 +226,113 @@ def _face_contacts(
     center = _add((side * shift[0] - half[0], *shift[1:]), down)
     center, p, q = _once((center, p, q))
     lowest = _add(_add(center, p), q)
-    candidates = _meeting(center, p, q, half)
-    kept = _outline(candidates, margin)
+    corners, real = _meeting(center, p, q, half)
+    kept = _outline(corners, real & (corners[0] < margin))
     none = ~kept[0][0]
     kept[0] = _where(none, (~none | none, lowest), kept[0])
 
-    distance, points = [], []
-    for real, (height, x, y) in kept:
-        distance.append(jnp.where(real, height, FAR))
-        at = _add(own.place, frame[0], side * (half[0] + 0.5 * height))
-        points.append(_add(_add(at, frame[1], x), frame[2], y))
-    return tuple(distance), tuple(points), tuple(side * x for x in frame[0])
+    real = jnp.stack([x for x, _ in kept])
+    height, x, y = (jnp.stack(z) for z in zip(*(z for _, z in kept), strict=True))
+    middle = side * (half[0] + 0.5 * height)
+    point = jnp.stack(
+        [
+            c + middle * u + x * v + y * w
+            for c, u, v, w in zip(own.place, *frame, strict=True)
+        ]
+    )
+    outward = jnp.stack([side * u for u in frame[0]])
+    return jnp.where(real, height, FAR), point, outward
 
 
 def _meeting(
     center: Vector, p: Vector, q: Vector, half: Vector
-) -> list[tuple[jax.Array, Vector]]:
-    """Return the corners of where two faces meet, 12, and whether they are there.
+) -> tuple[Vector, jax.Array]:
+    """Return the corners of where two faces meet.
 
-    One face is a rectangle of half extents (_, x, y) m, the other one is center + s p +
-    t q for s and t from -1 to 1: vectors of its height over the first, x and y.
+    Args:
+      center: of one face: its height over the other one, and where it is across, m.
+      p: from there to the middle of a side, m.
+      q: from there to the middle of the next side, m.
+      half: (_, x, y) half extents of the other face across, m.
+
+    Returns:
+      Twelve points, (12, P) a component, and which of them are there, (12, P).
     """
-    found = []
-    for along, across in ((p, q), (q, p)):
-        sides = [_sides(half[k], along[k]) for k in (1, 2)]
-        for sign in (1.0, -1.0):
-            middle = _add(center, across, sign)
-            low, high = jnp.full_like(half[0], -1.0), jnp.ones_like(half[0])
-            real = jnp.ones_like(low, bool)
-            for (crosses, slope, reach), limit, place in zip(
-                sides, half[1:], middle[1:], strict=True
-            ):
-                # What hardly moves across two sides is between them or not.
-                real &= crosses | (abs(place) <= limit)
-                low = jnp.maximum(low, -place * slope - reach)
-                high = jnp.minimum(high, -place * slope + reach)
-            low, high, real = _once((low, high, real & (low <= high)))
-            low, high = jnp.clip(low, -1.0, 1.0), jnp.clip(high, -1.0, 1.0)
-            found += [(real, _add(middle, along, end)) for end in (low, high)]
+    along = [jnp.stack([x, x, y, y]) for x, y in zip(p, q, strict=True)]
+    middle = [
+        jnp.stack([z + y, z - y, z + x, z - x])
+        for x, y, z in zip(p, q, center, strict=True)
+    ]
+    low, high = -jnp.ones_like(middle[0]), jnp.ones_like(middle[0])
+    real = jnp.ones_like(low, bool)
+    for limit, place, way in zip(half[1:], middle[1:], along[1:], strict=True):
+        # What hardly moves across two sides is between them or not.
+        crosses = abs(way) > 1e-9 * limit
+        slope = 1 / jnp.where(crosses, way, 1.0)
+        reach = jnp.where(crosses, limit * abs(slope), 2.0)
+        between = jnp.where(crosses, -place * slope, 0.0)
+        real &= crosses | (abs(place) <= limit)
+        low = jnp.maximum(low, between - reach)
+        high = jnp.minimum(high, between + reach)
+    real &= low <= high
+    low, high = jnp.clip(low, -1.0, 1.0), jnp.clip(high, -1.0, 1.0)
 
+    corner = [
+        jnp.stack([x, x, -x, -x]) if k else jnp.stack([x, -x, x, -x])
+        for k, x in enumerate(half[1:])
+    ]
+    x, y = corner[0] - center[1], corner[1] - center[2]
     area = 1 / (p[1] * q[2] - p[2] * q[1])
-    for one, two in itertools.product((1.0, -1.0), repeat=2):
-        place = one * half[1], two * half[2]
-        x, y = place[0] - center[1], place[1] - center[2]
-        s, t = (x * q[2] - y * q[1]) * area, (p[1] * y - p[2] * x) * area
-        # A corner on a corner is within at least one of the two faces.
-        real = jnp.maximum(abs(s), abs(t)) <= 1 + _ROUNDING
-        found.append((real, (center[0] + s * p[0] + t * q[0], *place)))
-    return found
+    s, t = (x * q[2] - y * q[1]) * area, (p[1] * y - p[2] * x) * area
+    # A corner on a corner is within at least one of the two faces.
+    within = jnp.maximum(abs(s), abs(t)) <= 1 + _ROUNDING
+    corner = [center[0] + s * p[0] + t * q[0], *corner]
+    points = tuple(
+        jnp.concatenate([m + low * w, m + high * w, c])
+        for m, w, c in zip(middle, along, corner, strict=True)
+    )
+    return points, jnp.concatenate([real, real, within])
 
 
-def _sides(limit: jax.Array, along: jax.Array) -> tuple[jax.Array, ...]:
-    """Return whether a line crosses two sides at all, its slope and reach to them."""
-    crosses = abs(along) > 1e-9 * limit
-    slope = jnp.where(crosses, 1 / jnp.where(crosses, along, 1.0), 0.0)
-    return crosses, slope, jnp.where(crosses, limit * abs(slope), 2.0)
+def _outline(points: Vector, real: jax.Array) -> list[tuple[jax.Array, Vector]]:
+    """Choose the deepest point of n that are real, and three that span most with it.
 
-
-def _outline(
-    candidates: list[tuple[jax.Array, Vector]], margin: jax.Array
-) -> list[tuple[jax.Array, Vector]]:
-    """Choose the deepest candidate, and three more that span most area with it.
-
-    Of those that are there and closer than the margin. What coincides with another one,
-    or lies between two, does not count.
+    Returns:
+      Each, and whether it counts, (P,): what coincides with another one, or lies
+      between two, does not.
     """
-    candidates = _once(candidates)
-    points = [point for _, point in candidates]
-    numbers = [jnp.full(margin.shape, k, jnp.int32) for k in range(len(points))]
     still = jax.lax.stop_gradient(points)
-    valid = [real & (z < margin) for real, (z, *_) in candidates]
+    number = jnp.arange(real.shape[0])[:, None]
 
-    def best(score: Any) -> tuple[jax.Array, Vector]:
-        scores = [
-            jnp.where(v, score(x), -jnp.inf) for v, x in zip(valid, still, strict=True)
-        ]
-        scores = _once(scores)
-        most, number = _once(_best(scores, numbers))
-        return most, _once(_pick(points, number))
+    def best(score: jax.Array) -> tuple[jax.Array, Vector]:
+        score = jnp.where(real, score, -jnp.inf)
+        mask = number == jnp.argmax(score, axis=0)
+        # A sum of one is a gather that runs along the pairs.
+        point = tuple(jnp.sum(jnp.where(mask, x, 0.0), axis=0) for x in points)
+        return jnp.max(score, axis=0), point
 
     def area(start: Vector, end: Vector, x: Vector) -> jax.Array:
         along, away = _add(end, start, -1.0), _add(x, start, -1.0)
         return along[1] * away[2] - along[2] * away[1]
 
-    deepest, one = best(lambda x: _SLOPE[0] * x[1] + _SLOPE[1] * x[2] - x[0])
+    deepest, one = best(_SLOPE[0] * still[1] + _SLOPE[1] * still[2] - still[0])
     a = jax.lax.stop_gradient(one)
-    square, two = best(lambda x: (x[1] - a[1]) ** 2 + (x[2] - a[2]) ** 2)
+    square, two = best((still[1] - a[1]) ** 2 + (still[2] - a[2]) ** 2)
     b = jax.lax.stop_gradient(two)
-    width, three = best(lambda x: abs(area(a, b, x)))
+    width, three = best(abs(area(a, b, still)))
     c = jax.lax.stop_gradient(three)
     around = _sign(area(a, b, c))
-
-    def outside(x: Vector) -> jax.Array:
-        sides = area(b, a, x), area(c, b, x), area(a, c, x)
-        return functools.reduce(jnp.maximum, [around * side for side in sides])
-
-    more, four = best(outside)
+    sides = area(b, a, still), area(c, b, still), area(a, c, still)
+    more, four = best(functools.reduce(jnp.maximum, [around * x for x in sides]))
     least = _ROUNDING * square
-    real = deepest > -jnp.inf, square > 0, width > least, more > least
-    return list(zip(real, (one, two, three, four), strict=True))
+    counts = deepest > -jnp.inf, square > 0, width > least, more > least
+    return list(zip(counts, (one, two, three, four), strict=True))
 
 
 def _edge_contact(
     first: _Box, second: _Box, edges: tuple[jax.Array, jax.Array]
-) -> tuple[jax.Array, Vector, Vector]:
-    """Return gap, middle and normal of where edges cross."""
+) -> engine.Points:
+    """Return gap (P,), middle (3, P) and normal (3, P) of where edges cross."""
     turn, shift = _seen(first, second)
     turn, shift, a = (_first(x, edges[0]) for x in (turn, shift, first.half))
     columns = _first(tuple(zip(*turn, strict=True)), edges[1])
@@ -378,7 +361,8 @@ def _edge_contact(
     point = first.place
     for axis, part in zip(frame, middle, strict=True):
         point = _add(point, axis, 0.5 * part)
-    return gap, point, tuple(y * u + z * v for u, v in zip(*frame[1:], strict=True))
+    normal = [y * u + z * v for u, v in zip(*frame[1:], strict=True)]
+    return gap, jnp.stack(point), jnp.stack(normal)
 
 
 def _frame(normal: Vector) -> tuple[Vector, Vector, Vector]:
