@@ -269,7 +269,7 @@ def test_faces_meet_in_their_corners():
 
 def test_faces_of_one_size_keep_their_outline_whatever_the_rounding():
     rng = np.random.default_rng(2)
-    place, turn, half = scattered("stacked")
+    place, _, half = scattered("stacked")
     half[1] = half[0]
     place[1] = 0.0
     place[1, :, 2] = 2 * half[0, :, 2] - 1e-4

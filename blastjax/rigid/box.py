@@ -67,7 +67,6 @@ def box_box(model: mjx.Model, data: mjx.Data, pair: jax.Array) -> engine.Points:
     """Collide boxes with boxes: four points between faces, one between edges."""
     a, b = (_box(model, data, pair[:, side]) for side in (0, 1))
     margin = model.geom_margin[pair[:, 0]] + model.geom_margin[pair[:, 1]]
-    a, b = _once((a, b))
     chosen = _once(_choose(*jax.lax.stop_gradient((a, b))))
 
     own, other = _once(_where(chosen.swap, (b, a), (a, b)))
@@ -78,14 +77,13 @@ def box_box(model: mjx.Model, data: mjx.Data, pair: jax.Array) -> engine.Points:
     distance = jnp.where(by_edges, single, distance)
     point = jnp.where(by_edges, place[:, None], point)
     normal = jnp.where(by_edges, across, jnp.where(chosen.swap, -outward, outward))
-    frame = [x for axis in _frame(tuple(normal)) for x in axis]
-    parts = _once((*distance, *point.reshape(-1, len(pair)), *frame))
+    axes = [x for axis in _frame(tuple(normal)) for x in axis]
     # From pairs last to pairs first, in one go.
-    table = jnp.stack(parts).T
-    distance, point, frame = jnp.split(table, [POINTS, 4 * POINTS], axis=1)
-    point = point.reshape(-1, 3, POINTS).transpose(0, 2, 1).reshape(-1, 3)
-    frame = jnp.repeat(frame.reshape(-1, 3, 3), POINTS, axis=0)
-    return distance.reshape(-1), point, frame
+    rows = _once((*distance, *point.reshape(-1, len(pair)), *axes))
+    found = jnp.stack(rows).T
+    points = found[:, POINTS:-9].reshape(-1, 3, POINTS).transpose(0, 2, 1)
+    frame = jnp.repeat(found[:, -9:].reshape(-1, 3, 3), POINTS, axis=0)
+    return found[:, :POINTS].reshape(-1), points.reshape(-1, 3), frame
 
 
 def _box(model: mjx.Model, data: mjx.Data, geom: jax.Array) -> _Box:
