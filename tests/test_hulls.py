@@ -139,9 +139,9 @@ def assert_best(a, along, best, found, rounding):
     A face is preferred to edges that are barely shallower, and to those shallower by a
     slop only if its contacts are not deeper than they.
     """
-    preferred = best / hull._FACE_BIAS - rounding
+    preferred = best / hull.FACE_BIAS - rounding
     if along <= preferred:
-        assert along > preferred - hull._FACE_SLOP * np.abs(a.offset).max()
+        assert along > preferred - hull.FACE_SLOP * np.abs(a.offset).max()
         assert found.min() > preferred
 
 

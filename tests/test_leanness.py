@@ -139,7 +139,7 @@ def worlds():
 
 
 CONTACT = {"contact._meets", "engine.contact_frame", "rows._pyramids", "solver.solve"}
-CHUNK_CONTACT = {"collision_convex.box_box", "contact._excuse_overlap"}
+CHUNK_CONTACT = {"box.box_box", "contact._excuse_overlap"}
 GRACE = {"bodies._pass_on", "bodies.settle"}
 USER = {"engine.user_rows", "rows._user_jacobian"}
 STRESS = {"stress", "failure.judge", "world.bear", "world.contact_load"}

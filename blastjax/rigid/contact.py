@@ -24,7 +24,7 @@ from mujoco import mjx
 
 from blastjax import graph, pytree
 from blastjax.core import NONE
-from blastjax.rigid import engine, hull
+from blastjax.rigid import box, engine, hull
 from blastjax.rigid.bodies import Bodies
 from blastjax.rigid.scene import Scene
 
@@ -188,6 +188,8 @@ def _collider(
         return Collider(*table[other])
     if group.types == (_PLANE, _BOX):
         return Collider(_plane_box, 4)
+    if group.types == (_BOX, _BOX):
+        return Collider(box.box_box, box.POINTS)
     return Collider(group.find, group.count)
 
 

@@ -25,12 +25,12 @@ from blastjax.rigid import engine
 
 POINTS = 8
 """Contacts of a pair that has a plane or two hulls: an outline and the deepest."""
-_FAR = 1.0
+FAR = 1.0
 """Distance of contacts that are not there, m."""
-_FACE_BIAS = 0.95
+FACE_BIAS = 0.95
 """A crossing of edges must be this much shallower than a face to be preferred: faces
 give a whole outline, and two answers of equal depth must not take turns."""
-_FACE_SLOP = 0.01
+FACE_SLOP = 0.01
 """They must also be this much shallower, of the first hull's size, or shallower than
 all points in which the faces meet: a whole outline must not vanish for a hair."""
 _ANGLE = 0.3 + np.arange(POINTS - 1) * 2 * np.pi / (POINTS - 1)
@@ -99,7 +99,7 @@ def plane_hull(
         point = (corners + (data.geom_xpos[geom] - data.geom_xpos[plane])) @ turn.T
         height = point[:, 2]
         kept, on = _outline(point[:, :2], height, jnp.ones_like(height, bool))
-        distance = jnp.where(on, height[kept], _FAR)
+        distance = jnp.where(on, height[kept], FAR)
         middle = point[kept].at[:, 2].multiply(0.5)
         normal = jnp.zeros(3, point.dtype).at[2].set(1.0)
         return _placed(distance, middle, normal, data, plane)
@@ -143,7 +143,7 @@ def capsule_hull(
         )(balls)
         # At an end it would be the same contact twice.
         inner = (between > 1e-3) & (between < 1 - 1e-3)
-        distance = distance.at[2:].set(jnp.where(inner, distance[2:], _FAR))
+        distance = distance.at[2:].set(jnp.where(inner, distance[2:], FAR))
         third = 2 + jnp.argmin(jax.lax.stop_gradient(distance[2:]))
         kept = jnp.stack([jnp.zeros_like(third), jnp.ones_like(third), third])
         distance, point, frame = (x[kept] for x in (distance, point, frame))
@@ -188,14 +188,14 @@ def meet(a: _Solid, b: _Solid) -> tuple[jax.Array, jax.Array, jax.Array]:
     distance, point = _face_contacts(own, other, pick(low_b, low_a))
     normal = jnp.where(swap, -own[1], own[1])
     edge_a, edge_b, best_edge = _edge_gap(still_a, still_b)
-    crossing = best_edge * jnp.where(best_edge < 0, 1 / _FACE_BIAS, _FACE_BIAS)
+    crossing = best_edge * jnp.where(best_edge < 0, 1 / FACE_BIAS, FACE_BIAS)
     by_edges = crossing > best_face + slack
     # Where the faces meet they may be no deeper than the edges: a vertex elsewhere is.
     deepest = jnp.min(jax.lax.stop_gradient(distance))
-    slop = _FACE_SLOP * jnp.max(jnp.abs(still_a.offset))
+    slop = FACE_SLOP * jnp.max(jnp.abs(still_a.offset))
     by_edges &= (crossing > deepest + slack) | (best_edge > best_face + slop)
     gap, place, across = _edge_contact(a, b, edge_a, edge_b)
-    single = jnp.full_like(distance, _FAR).at[0].set(gap)
+    single = jnp.full_like(distance, FAR).at[0].set(gap)
     distance = jnp.where(by_edges, single, distance)
     point = jnp.where(by_edges, place[None], point)
     return distance, point, jnp.where(by_edges, across, normal)
@@ -367,7 +367,7 @@ def _face_contacts(
     kept, on = _outline(candidates @ across.T, distance, valid)
     distance, point = distance[kept], candidates[kept]
     point = point - 0.5 * distance[:, None] * normal
-    return jnp.where(on, distance, _FAR), point
+    return jnp.where(on, distance, FAR), point
 
 
 def _tangents(normal: jax.Array) -> jax.Array:
