@@ -82,7 +82,7 @@ class Resting(pytree.Node):
     rolling resistance."""
     hold: jax.Array | float = 0.3
     """() what something asleep withstands: more wakes it."""
-    speed: jax.Array | float = 0.02
+    speed: jax.Array | float = 0.04
     """() what is slower than this for the delay falls asleep, m/s."""
     delay: jax.Array | float = 0.2
     """() s. Whenever something parts, all wake."""
