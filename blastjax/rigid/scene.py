@@ -82,9 +82,9 @@ class Resting(pytree.Node):
     rolling resistance."""
     hold: jax.Array | float = 0.3
     """() what something asleep withstands: more wakes it."""
-    speed: jax.Array | float = 0.04
+    speed: jax.Array | float = 0.05
     """() what is slower than this for the delay falls asleep, m/s."""
-    delay: jax.Array | float = 0.2
+    delay: jax.Array | float = 0.25
     """() s. Whenever something parts, all wake."""
 
 
