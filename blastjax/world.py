@@ -488,8 +488,8 @@ def _regroup(
 
     # Most steps see nothing come apart.
     parts = graph.anywhere(jnp.any(parted.created) | jnp.any(gone))
-    before = world.bodies, *(getattr(world.data, name) for name in _MOTION)
-    riding, *motion = jax.lax.cond(parts, anew, lambda *same: same, *before)
+    kept = world.bodies, *(getattr(world.data, name) for name in _MOTION)
+    riding, *motion = jax.lax.cond(parts, anew, lambda *same: same, *kept)
     data = world.data.replace(**dict(zip(_MOTION, motion, strict=True)))
     world = world.replace(state=state, bodies=riding, data=data, debris=debris)
     return world, gone

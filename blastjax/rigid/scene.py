@@ -83,7 +83,8 @@ class Resting(pytree.Node):
     hold: jax.Array | float = 0.3
     """() what something asleep withstands: more wakes it."""
     speed: jax.Array | float = 0.05
-    """() what is slower than this for the delay falls asleep, m/s."""
+    """() what is slower than this for the delay falls asleep, m/s; what gains speed
+    from rest counts as faster. Soft friction lets pieces creep at some cm/s."""
     delay: jax.Array | float = 0.25
     """() s. Whenever something parts, all wake."""
 
