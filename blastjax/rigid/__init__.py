@@ -15,19 +15,31 @@ are.
 | `contact` | pairs, manifolds and caps; forces and impulses on the chunks |
 | `rows` | what contacts and the user's constraints ask of the solver |
 | `resting` | how what lies comes to rest, where a scene asks for it |
+| `box` | boxes against boxes, all pairs side by side |
 | `hull` | convex hulls that differ, by one collider for all pairs |
 | `tables` | host: which hull each geom has, and the meshes that are drawn |
 | `solver` | the contact problem, by Newton's method with an implicit derivative |
 | `engine` | the only tie to MJX's private functions; a canary test watches it |
 """
 
-from blastjax.rigid import bodies, contact, engine, hull, resting, rows, scene, solver
+from blastjax.rigid import (
+    bodies,
+    box,
+    contact,
+    engine,
+    hull,
+    resting,
+    rows,
+    scene,
+    solver,
+)
 from blastjax.rigid.scene import Resting, Scene, build
 
 __all__ = [
     "Resting",
     "Scene",
     "bodies",
+    "box",
     "build",
     "contact",
     "engine",

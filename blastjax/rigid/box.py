@@ -6,7 +6,7 @@ in which they meet, four points of it; two edges give one point. The choice of f
 is piecewise constant; depth, place and normal are differentiable in poses and sizes
 between its jumps.
 
-Every number here is an array of pairs, and vectors are tuples of them: only so a
+Every number is an array of pairs, (P,) or (n, P), and vectors are tuples: only so a
 compiler for CPUs runs along the pairs with all its lanes, ten times faster than with
 rows of three numbers. What depends on a choice among three axes turns its tuples until
 the chosen one is the first. Everything is relative to one box of a pair, so nothing is
