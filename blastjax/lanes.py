@@ -233,17 +233,52 @@ def islands(way: Order, alive: jax.Array) -> jax.Array:
     names = jnp.pad(way.visit, (0, GROUP)).astype(dtype)
     labels = jnp.broadcast_to(names[:, None], (num_nodes + GROUP, num_copies))
 
+    bits = _bits(way, alive)
+
     def offer(
-        labels: jax.Array, here: jax.Array, near: jax.Array, by: jax.Array
+        labels: jax.Array, at: tuple[jax.Array, ...], near: jax.Array, by: jax.Array
     ) -> jax.Array:
-        del here
-        return jnp.where(take_rows(alive, by), take_rows(labels, near), none)
+        side, first, slot = at
+        if isinstance(slot, int):
+            here = lax.dynamic_slice(
+                bits, (side, first, jnp.uint32(0)), (1, GROUP, num_copies)
+            )[0]
+            kept = (here & jnp.array(1 << slot, bits.dtype)) != 0
+        else:
+            kept = take_rows(alive, by)
+        return jnp.where(kept, take_rows(labels, near), none)
 
     def ease(labels: jax.Array, count: jax.Array) -> jax.Array:
         jumps = (count >= 2 * PATIENCE) & (count % 8 == 0)
         return lax.cond(jumps, lambda x: _jump(x, way), lambda x: x, labels)
 
     return take_rows(_settle(labels, way, offer, ease), way.turn)
+
+
+def _bits(way: Order, alive: jax.Array) -> jax.Array:
+    """Pack which of each row's first neighbours are joined to it.
+
+    A sweep then reads one row for all of them.
+
+    Args:
+      way: the way through the graph, of N nodes and B edges.
+      alive: (B, T) bool.
+
+    Returns:
+      (2, N + GROUP, T) unsigned, a bit for each of the K neighbours in `way.near`.
+    """
+    width = way.near.shape[2]
+    dtype = jnp.uint8 if width <= 8 else jnp.uint16
+
+    def pack(by: jax.Array) -> jax.Array:
+        packed = jnp.zeros((by.shape[0], alive.shape[1]), dtype)
+        for j in range(width):
+            bit = jnp.array(1 << j, dtype)
+            packed |= jnp.where(take_rows(alive, by[:, j]), bit, 0).astype(dtype)
+        return packed
+
+    both = pack(way.by.reshape(-1, width)).reshape(*way.by.shape[:2], -1)
+    return lax.optimization_barrier(both)
 
 
 def _sweep(
@@ -274,7 +309,9 @@ def _sweep(
             near = lax.dynamic_slice(way.near, at, size)[0]
             by = lax.dynamic_slice(way.by, at, size)[0]
             for j in range(degree):
-                low = jnp.minimum(low, offer(rows, first, near[:, j], by[:, j]))
+                low = jnp.minimum(
+                    low, offer(rows, (side, first, j), near[:, j], by[:, j])
+                )
             return low
 
         return relax
@@ -291,7 +328,7 @@ def _sweep(
             entry = jnp.minimum(start + j, last)
             near = jnp.where(there_is, way.node[side][entry], own)
             by = way.edge[side][entry]
-            return jnp.minimum(low, offer(rows, first, near, by))
+            return jnp.minimum(low, offer(rows, (side, first, j), near, by))
 
         low = of_degree(width)(rows, first)
         return lax.fori_loop(jnp.uint32(width), jnp.max(degree), one, low)
@@ -372,10 +409,10 @@ def touched(way: Order, flags: jax.Array) -> jax.Array:
     own = jnp.arange(GROUP, dtype=jnp.uint32)
 
     def offer(
-        clean: jax.Array, first: jax.Array, near: jax.Array, by: jax.Array
+        clean: jax.Array, at: tuple[jax.Array, ...], near: jax.Array, by: jax.Array
     ) -> jax.Array:
         del clean
-        return (near == first + own)[:, None] | ~take_rows(flags, by)
+        return (near == at[1] + own)[:, None] | ~take_rows(flags, by)
 
     clean = jnp.ones((num_nodes + GROUP, num_copies), bool)
     for side in (0, 1):
