@@ -19,8 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-LANES = 128
-"""Copies in a tile: labels that are read again soon stay in a core's first cache."""
+LANES = 256
+"""Copies in a tile: many share what a step costs, few wait long for the slowest."""
 LIMIT = 65535
 """Nodes from which labels no longer fit 16 bits."""
 PATIENCE = 16
@@ -33,6 +33,8 @@ GROUP = 4
 """Nodes that a sweep visits at a time: a step of a loop costs as much as some rows."""
 BLOCK = 8
 """Copies that are turned into lanes at a time; they divide those in a tile."""
+WINDOW = 256
+"""Nodes among which those are sought that go well into one group."""
 SURE = 3
 """Sweeps before it is worth a look whether anything still changes."""
 
@@ -98,14 +100,11 @@ def order(
     turn = np.arange(num_nodes)
     if place is not None:
         turn = _inverse(np.argsort(np.asarray(place), kind="stable"))
-    # Level by level nothing else comes before its turn, but more goes into a group.
-    level = _levels(np.sort(turn[edges], axis=1), num_nodes)[turn]
-    real = edges[edges[:, 0] != edges[:, 1]]
-    busy = np.bincount(real.reshape(-1), minlength=num_nodes)
-    visit = np.lexsort((turn, busy, level))
+    pairs = np.sort(turn[edges], axis=1)
+    visit, group = _groups(pairs[pairs[:, 0] < pairs[:, 1]], num_nodes)
+    visit = _inverse(turn)[visit]
     turn = _inverse(visit)
     early, late = np.sort(turn[edges], axis=1).T
-    group = _groups(early, late, num_nodes)
     width = _width(num_nodes, len(edges))
     sides = [_side(late, early, num_nodes, width), _side(early, late, num_nodes, width)]
     near, by, start, degree, node, edge = map(np.stack, zip(*sides, strict=True))
@@ -157,31 +156,48 @@ def _inverse(permutation: np.ndarray) -> np.ndarray:
     return inverse
 
 
-def _levels(pairs: np.ndarray, num_rows: int) -> np.ndarray:
-    """Return how long a chain of neighbours before it each row ends, (N,).
+def _groups(pairs: np.ndarray, num_nodes: int) -> tuple[np.ndarray, np.ndarray]:
+    """Gather nodes that a sweep can visit at once into groups.
+
+    No node comes before a neighbour that is to come before it, so the labels are those
+    of a sweep one by one. Who begins the longest chain leads a group, and those join
+    that have about as many neighbours on either side, for a group is as slow as its
+    busiest.
 
     Args:
-      pairs: (B, 2) rows, the earlier first; of a row with itself for padding.
-      num_rows: N.
+      pairs: (B, 2) nodes by their turn, the earlier first.
+      num_nodes: N.
+
+    Returns:
+      (N,) turns, in the order of the visits, and the group of each, (N,).
     """
-    pairs = pairs[pairs[:, 0] < pairs[:, 1]]
-    level = [0] * num_rows
-    for early, late in pairs[np.argsort(pairs[:, 1], kind="stable")].tolist():
-        level[late] = max(level[late], level[early] + 1)
-    return np.array(level)
-
-
-def _groups(early: np.ndarray, late: np.ndarray, num_rows: int) -> np.ndarray:
-    """Return the group of each row, (N,), by pairs of rows (B,), (B,)."""
-    last = np.full(num_rows, -1)
-    joined = early < late
-    np.maximum.at(last, late[joined], early[joined])
-    begins, first = [], 0
-    for row, before in enumerate(last.tolist()):
-        if before >= first or row - first == GROUP:
-            first = row
-        begins.append(first == row)
-    return np.cumsum(begins) - 1
+    degree = np.stack([np.bincount(x, minlength=num_nodes) for x in pairs.T[::-1]], 1)
+    behind: list[list[int]] = [[] for _ in range(num_nodes)]
+    for early, late in pairs.tolist():
+        behind[early].append(late)
+    chain = np.zeros(num_nodes, int)
+    for node in range(num_nodes - 1, -1, -1):
+        chain[node] = max((chain[x] + 1 for x in behind[node]), default=0)
+    waits = degree[:, 0].tolist()
+    ready = np.flatnonzero(degree[:, 0] == 0)
+    visit: list[int] = []
+    group: list[int] = []
+    while len(ready):
+        near, rest = ready[:WINDOW], ready[WINDOW:]
+        lead = near[np.argmax(chain[near])]
+        unlike = np.abs(degree[near] - degree[lead]).sum(axis=1) - chain[near]
+        unlike[near == lead] = -num_nodes - 1
+        near = near[np.argsort(unlike, kind="stable")]
+        chosen = near[:GROUP].tolist()
+        group += [group[-1] + 1 if group else 0] * len(chosen)
+        visit += chosen
+        free: list[int] = []
+        for late in (x for node in chosen for x in behind[node]):
+            waits[late] -= 1
+            if waits[late] == 0:
+                free.append(late)
+        ready = np.concatenate([near[GROUP:], rest, np.array(free, int)])
+    return np.array(visit), np.array(group)
 
 
 def _side(
@@ -217,17 +233,52 @@ def islands(way: Order, alive: jax.Array) -> jax.Array:
     names = jnp.pad(way.visit, (0, GROUP)).astype(dtype)
     labels = jnp.broadcast_to(names[:, None], (num_nodes + GROUP, num_copies))
 
+    bits = _bits(way, alive)
+
     def offer(
-        labels: jax.Array, here: jax.Array, near: jax.Array, by: jax.Array
+        labels: jax.Array, at: tuple[jax.Array, ...], near: jax.Array, by: jax.Array
     ) -> jax.Array:
-        del here
-        return jnp.where(take_rows(alive, by), take_rows(labels, near), none)
+        side, first, slot = at
+        if isinstance(slot, int):
+            here = lax.dynamic_slice(
+                bits, (side, first, jnp.uint32(0)), (1, GROUP, num_copies)
+            )[0]
+            kept = (here & jnp.array(1 << slot, bits.dtype)) != 0
+        else:
+            kept = take_rows(alive, by)
+        return jnp.where(kept, take_rows(labels, near), none)
 
     def ease(labels: jax.Array, count: jax.Array) -> jax.Array:
         jumps = (count >= 2 * PATIENCE) & (count % 8 == 0)
         return lax.cond(jumps, lambda x: _jump(x, way), lambda x: x, labels)
 
     return take_rows(_settle(labels, way, offer, ease), way.turn)
+
+
+def _bits(way: Order, alive: jax.Array) -> jax.Array:
+    """Pack which of each row's first neighbours are joined to it.
+
+    A sweep then reads one row for all of them.
+
+    Args:
+      way: the way through the graph, of N nodes and B edges.
+      alive: (B, T) bool.
+
+    Returns:
+      (2, N + GROUP, T) unsigned, a bit for each of the K neighbours in `way.near`.
+    """
+    width = way.near.shape[2]
+    dtype = jnp.uint8 if width <= 8 else jnp.uint16
+
+    def pack(by: jax.Array) -> jax.Array:
+        packed = jnp.zeros((by.shape[0], alive.shape[1]), dtype)
+        for j in range(width):
+            bit = jnp.array(1 << j, dtype)
+            packed |= jnp.where(take_rows(alive, by[:, j]), bit, 0).astype(dtype)
+        return packed
+
+    both = pack(way.by.reshape(-1, width)).reshape(*way.by.shape[:2], -1)
+    return lax.optimization_barrier(both)
 
 
 def _sweep(
@@ -247,6 +298,7 @@ def _sweep(
     """
     zero = jnp.uint32(0)
     side = side.astype(jnp.uint32)
+    width = way.near.shape[2]
 
     def of_degree(degree: int) -> Callable[[jax.Array, jax.Array], jax.Array]:
         def relax(rows: jax.Array, first: jax.Array) -> jax.Array:
@@ -257,7 +309,9 @@ def _sweep(
             near = lax.dynamic_slice(way.near, at, size)[0]
             by = lax.dynamic_slice(way.by, at, size)[0]
             for j in range(degree):
-                low = jnp.minimum(low, offer(rows, first, near[:, j], by[:, j]))
+                low = jnp.minimum(
+                    low, offer(rows, (side, first, j), near[:, j], by[:, j])
+                )
             return low
 
         return relax
@@ -274,11 +328,12 @@ def _sweep(
             entry = jnp.minimum(start + j, last)
             near = jnp.where(there_is, way.node[side][entry], own)
             by = way.edge[side][entry]
-            return jnp.minimum(low, offer(rows, first, near, by))
+            return jnp.minimum(low, offer(rows, (side, first, j), near, by))
 
-        return lax.fori_loop(zero, jnp.max(degree), one, _group(rows, first))
+        low = of_degree(width)(rows, first)
+        return lax.fori_loop(jnp.uint32(width), jnp.max(degree), one, low)
 
-    branches = [*map(of_degree, steps(way.near.shape[2])), hub]
+    branches = [*map(of_degree, steps(width)), hub]
 
     def visit(i: jax.Array, rows: jax.Array) -> jax.Array:
         i = jnp.where(side == 0, i, way.groups - 1 - i)
@@ -354,10 +409,10 @@ def touched(way: Order, flags: jax.Array) -> jax.Array:
     own = jnp.arange(GROUP, dtype=jnp.uint32)
 
     def offer(
-        clean: jax.Array, first: jax.Array, near: jax.Array, by: jax.Array
+        clean: jax.Array, at: tuple[jax.Array, ...], near: jax.Array, by: jax.Array
     ) -> jax.Array:
         del clean
-        return (near == first + own)[:, None] | ~take_rows(flags, by)
+        return (near == at[1] + own)[:, None] | ~take_rows(flags, by)
 
     clean = jnp.ones((num_nodes + GROUP, num_copies), bool)
     for side in (0, 1):
