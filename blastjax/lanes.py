@@ -39,6 +39,11 @@ SURE = 3
 """Sweeps before it is worth a look whether anything still changes."""
 
 
+Where = tuple[jax.Array, jax.Array, int | jax.Array]
+Offer = Callable[[jax.Array, Where, jax.Array, jax.Array], jax.Array]
+"""What neighbours offer to a group of rows: see `_sweep`."""
+
+
 class Order(NamedTuple):
     """The way through a graph of N nodes and B edges.
 
@@ -236,14 +241,13 @@ def islands(way: Order, alive: jax.Array) -> jax.Array:
     bits = _bits(way, alive)
 
     def offer(
-        labels: jax.Array, at: tuple[jax.Array, ...], near: jax.Array, by: jax.Array
+        labels: jax.Array, at: Where, near: jax.Array, by: jax.Array
     ) -> jax.Array:
-        side, first, slot = at
-        if isinstance(slot, int):
-            here = lax.dynamic_slice(
-                bits, (side, first, jnp.uint32(0)), (1, GROUP, num_copies)
-            )[0]
-            kept = (here & jnp.array(1 << slot, bits.dtype)) != 0
+        side, first, which = at
+        if isinstance(which, int):
+            start = side, first, jnp.uint32(0)
+            here = lax.dynamic_slice(bits, start, (1, GROUP, num_copies))[0]
+            kept = (here & jnp.array(1 << which, bits.dtype)) != 0
         else:
             kept = take_rows(alive, by)
         return jnp.where(kept, take_rows(labels, near), none)
@@ -285,7 +289,7 @@ def _sweep(
     rows: jax.Array,
     way: Order,
     side: jax.Array,
-    offer: Callable[[jax.Array, jax.Array, jax.Array, jax.Array], jax.Array],
+    offer: Offer,
 ) -> jax.Array:
     """Lower rows, group by group, to the least of what their neighbours offer.
 
@@ -293,8 +297,9 @@ def _sweep(
       rows: (N + GROUP or more, T).
       way: the way through the graph.
       side: () 0 forward, 1 backward.
-      offer: of rows, the first row of a group, a neighbour of each of its rows (n,), or
-        the row itself, and the edges to them (n,): (n, T).
+      offer: of rows, where (side, the first row of a group, which of their neighbours,
+        an int if it is in `way.near`), that neighbour of each of the group's rows (n,),
+        or the row itself, and the edges to them (n,): (n, T).
     """
     zero = jnp.uint32(0)
     side = side.astype(jnp.uint32)
@@ -366,7 +371,7 @@ def _jump(labels: jax.Array, way: Order) -> jax.Array:
 def _settle(
     rows: jax.Array,
     way: Order,
-    offer: Callable[[jax.Array, jax.Array, jax.Array, jax.Array], jax.Array],
+    offer: Offer,
     ease: Callable[[jax.Array, jax.Array], jax.Array] = lambda rows, count: rows,
 ) -> jax.Array:
     """Sweep to and fro until nothing changes.
@@ -408,9 +413,7 @@ def touched(way: Order, flags: jax.Array) -> jax.Array:
     num_nodes, num_copies = way.visit.shape[0], flags.shape[1]
     own = jnp.arange(GROUP, dtype=jnp.uint32)
 
-    def offer(
-        clean: jax.Array, at: tuple[jax.Array, ...], near: jax.Array, by: jax.Array
-    ) -> jax.Array:
+    def offer(clean: jax.Array, at: Where, near: jax.Array, by: jax.Array) -> jax.Array:
         del clean
         return (near == at[1] + own)[:, None] | ~take_rows(flags, by)
 

@@ -15,9 +15,9 @@ A slot that has hardly moved for a while is asleep, and then brakes by more, on 
 contacts, whether they stick or slide: it is what slides so slowly that would otherwise
 hop on for seconds, or creep: a shard wedged among others slips at a few centimetres a
 second, for soft friction is viscous. What gains speed is not taken to creep, so what
-friction cannot hold does slide. Only what pops out of another is left out. Only the ground resists,
-and what stands on it, directly or through others: among pieces in flight momentum is
-kept. Sizes: K slots, C contacts.
+friction cannot hold does slide. Only what pops out of another is left out. Only the
+ground resists, and what stands on it, directly or through others: among pieces in
+flight momentum is kept. Sizes: K slots, C contacts.
 """
 
 import math
