@@ -1,12 +1,14 @@
 """Islands of many copies of a graph: the same as one by one, whatever the batch is."""
 
 import functools
+import re
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.sparse
+from jax import lax
 from scipy.sparse import csgraph
 
 from blastjax import graph, lanes
@@ -192,3 +194,22 @@ def test_bottlenecks_without_edges():
     value, edge = jax.vmap(lambda w, s: graph.bottleneck(none, w, s, 3))(weight, source)
     np.testing.assert_array_equal(value, np.where(source, np.inf, -np.inf))
     assert (edge == -1).all()
+
+
+def test_a_condition_anywhere_in_a_batch_stays_a_condition():
+    def doubled(x):
+        return lax.cond(
+            graph.anywhere(x > 0), lambda x: jnp.maximum(x, 0) * x, jnp.zeros_like, x
+        )
+
+    x = jnp.array([[1.0, -2.0, 3.0], [-1.0, -2.0, -3.0]])
+    batch = jax.vmap(jax.vmap(doubled))
+    wanted = jnp.where(x > 0, x * x, 0)
+    np.testing.assert_array_equal(jax.jit(batch)(x), wanted)
+    np.testing.assert_array_equal(jax.grad(lambda x: batch(x).sum())(x), 2 * wanted / x)
+    # One flag for all, at every level: a batch of them would turn it into a select.
+    conditions = re.findall(r"cond\[|platform_index", str(jax.make_jaxpr(batch)(x)))
+    assert conditions == ["cond["]
+    flag = jax.vmap(jax.vmap(graph.anywhere))(x > 0)
+    np.testing.assert_array_equal(flag, np.ones((2, 3), bool))
+    assert not jax.vmap(graph.anywhere)(x[1] > 0).any()
