@@ -308,6 +308,7 @@ def measured(place, spin, half, turn, weight):
     return total + jnp.sum(weight[2] * frame, axis=(1, 2)), on
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_differences():
     place, turn, half = scattered("random")
     rng = np.random.default_rng(0)

@@ -385,6 +385,7 @@ MODULES = (
     *(equilibrium, failure, limits, loads, parity, world),
 )
 NO_DERIVATIVE = {
+    "graph.anywhere": "means one thing alone and another in a batch: test_lanes",
     "graph.one_of_many": "makes functions; fracture and chunks call them",
     "graph.side_by_side": "makes functions; fracture and chunks call them",
     "parity.network": "host",
