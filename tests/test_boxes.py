@@ -345,7 +345,9 @@ def test_derivatives_are_those_of_differences():
     assert touching.sum() > 100
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize(
+    "dtype", [np.float32, pytest.param(np.float64, marks=pytest.mark.slow)]
+)
 def test_coincident_and_touching_boxes_have_finite_derivatives(dtype):
     place = np.zeros((2, 6, 3), dtype)
     place[1, 1:4] = np.eye(3)

@@ -392,6 +392,7 @@ def operations(sites):
     return found.lower(riding, scene.model, data).as_text().count(" = ")
 
 
+@pytest.mark.slow
 def test_the_program_does_not_grow_with_the_number_of_shapes():
     few, many = operations(8), operations(16)
     # One program for every pair: only tables' sizes and what MJX does by geom differ.

@@ -77,6 +77,7 @@ def test_bad_options_exit_with_2(words, message, capsys, box, tmp_path, monkeypa
     assert message in said.err and "Traceback" not in said.err
 
 
+@pytest.mark.slow
 def test_small_run_writes_a_gif_and_says_what_broke(tmp_path):
     target = tmp_path / "breach.gif"
     words = (
