@@ -711,3 +711,21 @@ def test_unbreakable_healths_pass_through_init():
     scene = build(block(), slots=2)
     start = world.init(scene, bond_health=UNBREAKABLE)
     assert start.state.bond_unbreakable is not None
+
+
+def test_the_users_own_meet_where_no_chunk_meets_anything():
+    bits = 'contype="2" conaffinity="2"'
+    model = (
+        f'<mujoco><worldbody><geom type="plane" size="0 0 .05" {bits}/>'
+        f'<body pos="0 0 0.0995"><freejoint/><geom type="sphere" size="0.1" {bits}/>'
+        "</body></worldbody></mujoco>"
+    )
+    scene = build(
+        block((1, 1, 1)), model=model, position=(2.0, 0, 1.0), chunk_contacts=False
+    )
+    assert scene.host.chunk_sides == () and scene.host.user_meets
+    end, _ = jit(lambda w: world.rollout(scene, w, 50))(world.init(scene))
+    duration = 50 * scene.host.model.opt.timestep
+    fallen = 1.25 - end.data.qpos[scene.host.slot_qpos[0, 2]]
+    assert fallen == pytest.approx(9.81 * duration**2 / 2, rel=0.05)
+    assert end.data.qpos[2] == pytest.approx(0.1, abs=1e-3)

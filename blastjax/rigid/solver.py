@@ -308,7 +308,8 @@ def _user_block(problem: Problem, weight: Forces) -> jax.Array:
 
 
 def _coupled(problem: Problem) -> bool:
-    return any(len(c.sides) > 1 or c.user is not None for c in problem.contacts)
+    """Return whether there are contacts that could act on two of what moves."""
+    return any(len(c.sides) + (c.user is not None) > 1 for c in problem.contacts)
 
 
 def _hessian(problem: Problem, weight: Forces) -> jax.Array:
