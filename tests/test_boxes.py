@@ -1,6 +1,5 @@
 """Boxes against boxes: every axis tried, MuJoCo C, hulls, and their derivatives."""
 
-import functools
 from types import SimpleNamespace
 
 import jax
@@ -13,7 +12,6 @@ from blastjax.author import hulls as author
 from blastjax.rigid import box, engine, hull
 from tests.test_hulls import CUBE, rotation, table_of
 
-jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
 COUNT = 400
 """Pairs of a kind, the same for all: programs are shared."""
 ROUNDING = 1e-9
@@ -42,7 +40,7 @@ def contacts(place, turn, half):
     return distance.reshape(shape), point.reshape(*shape, 3), each
 
 
-collide = jit(contacts)
+collide = jax.jit(contacts)
 
 
 def scattered(kind):
@@ -240,7 +238,7 @@ def test_depth_agrees_with_that_of_hulls():
     between = np.einsum("nxi,nxj->nij", turn[0], turn[1])
     shift = np.einsum("nxi,nx->ni", turn[0], place[1] - place[0])
     number = np.arange(60)
-    theirs, _, normal = jit(jax.vmap(one))(number, 60 + number, between, shift)
+    theirs, _, normal = jax.jit(jax.vmap(one))(number, 60 + number, between, shift)
     normal = np.einsum("nxi,ni->nx", turn[0], normal)
     same = np.einsum("nx,nx->n", normal, frame[:60, 0]) > 1 - 1e-9
     touching = theirs.min(axis=1) < 0
@@ -288,7 +286,7 @@ def test_faces_of_one_size_keep_their_outline_whatever_the_rounding():
 
 def test_a_frame_is_completed_as_mujoco_completes_it():
     _, _, frame = collide(*scattered("random"))
-    expected = jit(jax.vmap(engine.contact_frame))(frame[:, 0])
+    expected = jax.jit(jax.vmap(engine.contact_frame))(frame[:, 0])
     np.testing.assert_allclose(frame, expected, atol=1e-12)
 
 
@@ -319,13 +317,13 @@ def test_derivatives_are_those_of_differences():
     def value(*start):
         return measured(*start, turn, weight)[0]
 
-    @jit
+    @jax.jit
     def slopes():
         _, forward = jax.jvp(value, start, tangent)
         back = jax.grad(lambda *x: value(*x).sum(), argnums=(0, 1, 2))(*start)
         return forward, back
 
-    @jit
+    @jax.jit
     def moved(step):
         return measured(
             *(x + step * t for x, t in zip(start, tangent, strict=True)), turn, weight
@@ -360,7 +358,7 @@ def test_coincident_and_touching_boxes_have_finite_derivatives(dtype):
         found = contacts(*x)
         return sum(jnp.sum(part) for part in found), found
 
-    slope, found = jit(jax.grad(total, argnums=(0, 1, 2), has_aux=True))(
+    slope, found = jax.jit(jax.grad(total, argnums=(0, 1, 2), has_aux=True))(
         place, turn, half
     )
     assert all(np.isfinite(x).all() for x in jax.tree.leaves((slope, found)))

@@ -1,7 +1,5 @@
 """Judging structures, letting them collapse, and stress in the step of a world."""
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,7 +17,6 @@ BRICK = 1000.0 * 0.5**3 * G
 NEVER = 1e12
 
 # Compiling is what these tests cost, not running.
-jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
 
 
 @pytest.fixture(autouse=True)
@@ -42,14 +39,14 @@ def standing(asset, structure, limits, state=None):
     """Let it collapse under its weight."""
     state = fracture.init(asset) if state is None else state
     load = weight(structure)
-    return jit(collapse)(structure, asset, state, load, limits)
+    return jax.jit(collapse)(structure, asset, state, load, limits)
 
 
 def test_column_uses_what_its_weight_asks():
     asset = shapes.grid((1, 1, 4), EDGE, anchor=("z-",))
     structure = stress.structure(asset)
     limits = stress.Limits(40e3, 50e3)
-    verdict = jit(judge)(
+    verdict = jax.jit(judge)(
         structure, asset, fracture.init(asset), weight(structure), limits
     )
     above = np.asarray(asset.bond_centroid[:, 2])
@@ -105,7 +102,7 @@ def bridge():
 
 def without(asset, node):
     blow = jnp.zeros(asset.element_chunk.shape[0]).at[node].set(1.0)
-    return jit(fracture.step)(asset, fracture.init(asset), Damage(chunk=blow))[0]
+    return jax.jit(fracture.step)(asset, fracture.init(asset), Damage(chunk=blow))[0]
 
 
 def test_bridge_stands_on_both_pillars_and_falls_off_one(bridge):
@@ -113,7 +110,7 @@ def test_bridge_stands_on_both_pillars_and_falls_off_one(bridge):
     states = [without(asset, node) for node in (8, 1, 3)]
     stacked = jax.tree.map(lambda *x: jnp.stack(x), fracture.init(asset), *states)
     run = jax.vmap(lambda s: collapse(structure, asset, s, weight(structure), limits))
-    together, how = jit(run)(stacked)
+    together, how = jax.jit(run)(stacked)
     assert bool(how.settled.all())
     broken = how.fracture.bond_broken.sum(axis=1)
     held = (together.actor[:, 1:] == 0).sum(axis=1)
@@ -131,7 +128,7 @@ def test_bridge_stands_on_both_pillars_and_falls_off_one(bridge):
 def test_collapse_stops_at_the_cap_and_says_so(bridge):
     asset, structure, limits = bridge
     state = without(asset, 1)
-    run = jit(
+    run = jax.jit(
         lambda s, n: collapse(structure, asset, s, weight(structure), limits, rounds=n)[
             1
         ]
@@ -172,7 +169,7 @@ def test_safety_has_the_derivative_of_the_worst_bond():
             )
             return judge(sized, asset, state, load, limits, area=area).safety[0]
 
-        both = jit(jax.value_and_grad(safety))
+        both = jax.jit(jax.value_and_grad(safety))
         scale = np.array([1.0, 0.8, 1.1, 0.9])
         slope, h = np.asarray(both(scale)[1]), 1e-6
         assert np.isfinite(slope).all() and np.abs(slope).max() > 0.1
@@ -188,12 +185,12 @@ def test_excess_is_what_the_limit_left_of_the_load():
     structure = stress.structure(asset)
     bear = stress.Limits(NEVER, NEVER, 1.0, 1.5 * BRICK / 0.25)
     state = fracture.init(asset)
-    verdict = jit(judge)(structure, asset, state, weight(structure), bear)
+    verdict = jax.jit(judge)(structure, asset, state, weight(structure), bear)
     dealt = Damage(bond=jnp.where(asset.bond_nodes[:, 1] == 0, 2.0, 0.0))
-    state, (broken, _) = jit(fracture.step)(asset, state, dealt)
+    state, (broken, _) = jax.jit(fracture.step)(asset, state, dealt)
     center = chunks.moments(asset, state, 1000.0).center
     gone = broken.bond_broken
-    force, torque = jit(excess)(asset, state, verdict, gone, bear, center)
+    force, torque = jax.jit(excess)(asset, state, verdict, gone, bear, center)
     # Two bricks hung from a bond that bears one and a half.
     np.testing.assert_allclose(force[1], [0, 0, -0.5 * BRICK], rtol=1e-4, atol=1e-2)
     np.testing.assert_allclose(force[0], -force[1], rtol=1e-6)
@@ -229,7 +226,7 @@ def test_cantilever_falls_in_a_world_when_its_weight_is_too_much(relaxed):
     structure = stress.structure(scene.asset)
     start = world.init(scene)
 
-    @jit
+    @jax.jit
     def step(moment, limits):
         return world.step(scene, moment, stress=world.Stress(structure, limits))
 
@@ -258,7 +255,7 @@ def test_contacts_load_the_chunks_as_they_push_the_body(relaxed):
     )
     start = world.init(scene, velocity=(1.5, 0.4, -0.2), spin=(0.1, 0.2, 3.0))
 
-    @jit
+    @jax.jit
     def both(start):
         moment, _ = world.step(scene, start)
         frames = bodies.frames(scene, start.bodies, start.data)

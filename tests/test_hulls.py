@@ -1,7 +1,5 @@
 """Convex hulls: their tables, their contacts against brute force and MuJoCo C."""
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -14,7 +12,6 @@ from blastjax.author.mesh import Mesh, moments
 from blastjax.rigid import Resting, bodies, build, contact, hull
 from tests import pieces
 
-jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
 CUBE = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T * 0.5
 FIELDS = ("vertices", "normal", "offset", "corners", "size", "edges", "sides")
 ROUNDING = 1e-9
@@ -69,7 +66,7 @@ def crowd():
         shift, axis=1, keepdims=True
     )
     with jax.enable_x64(True), jax.numpy_rank_promotion("allow"):
-        found = jit(meet)(table_of(solids), pair, turn, shift)
+        found = jax.jit(meet)(table_of(solids), pair, turn, shift)
     return solids, pair, turn, shift, [np.asarray(x) for x in found]
 
 
@@ -207,7 +204,7 @@ def test_depth_agrees_with_mujoco_c(crowd):
 
 def test_a_cube_on_a_cube_meets_in_four_corners():
     table = table_of([author.hull(CUBE), author.hull(CUBE * [0.5, 0.3, 1])])
-    distance, point, normal = jit(meet)(
+    distance, point, normal = jax.jit(meet)(
         table,
         np.array([[0, 1], [1, 0]]),
         np.stack([np.eye(3)] * 2),
@@ -230,7 +227,7 @@ def test_crossed_edges_meet_in_one_point():
     half = np.sqrt(0.5)
     low = rotation(np.array([np.cos(np.pi / 8), np.sin(np.pi / 8), 0, 0]))
     high = rotation(np.array([np.cos(np.pi / 8), 0, np.sin(np.pi / 8), 0]))
-    distance, point, normal = jit(meet)(
+    distance, point, normal = jax.jit(meet)(
         table_of([solid]),
         np.array([[0, 0]]),
         (low.T @ high)[None],
@@ -255,9 +252,9 @@ def test_derivatives_are_those_of_differences(crowd):
         return jnp.min(found[0], axis=1)
 
     zero = jnp.zeros((len(chosen), 3))
-    back = jit(jax.grad(lambda move: depth(move).sum()))(zero)
-    both = jit(lambda tangent: jax.jvp(depth, (zero,), (tangent,))[1])
-    value = jit(depth)
+    back = jax.jit(jax.grad(lambda move: depth(move).sum()))(zero)
+    both = jax.jit(lambda tangent: jax.jvp(depth, (zero,), (tangent,))[1])
+    value = jax.jit(depth)
     for axis in range(3):
         tangent = zero.at[:, axis].set(1.0)
         forward = both(tangent)
@@ -282,7 +279,7 @@ def test_coincident_hulls_have_finite_contacts_and_derivatives(dtype):
         found = meet(table, pair, turn, shift)
         return sum(jnp.sum(x) for x in found), found
 
-    slope, found = jit(jax.grad(total, has_aux=True))(shift)
+    slope, found = jax.jit(jax.grad(total, has_aux=True))(shift)
     assert all(np.isfinite(x).all() for x in found)
     assert np.isfinite(slope).all()
 
@@ -322,7 +319,7 @@ def test_round_shapes_meet_a_box_as_in_c(kind):
         )
         return find(scene.model, data, jnp.array([[ball, geom]]))
 
-    distance, _, frame = jit(jax.vmap(ours))(places, turns)
+    distance, _, frame = jax.jit(jax.vmap(ours))(places, turns)
     assert distance.shape[1] == count
     touching = 0
     for k, (place, turn) in enumerate(zip(places, turns, strict=True)):
@@ -408,7 +405,7 @@ def test_data_has_room_for_what_is_found():
     assert impl.contact.dist.shape == (hull.POINTS,)
     assert impl.contact.dim.tolist() == [3] * hull.POINTS
     assert impl.efc_force.shape == (4 * hull.POINTS,)
-    now, _ = jit(world.step)(scene, start)
+    now, _ = jax.jit(world.step)(scene, start)
     assert jax.tree.map(jnp.shape, now) == jax.tree.map(jnp.shape, start)
     force = contact.normal_force(now.data)
     assert (np.asarray(force) > 0).sum() == 4

@@ -13,7 +13,6 @@ from blastjax.core import Damage
 from blastjax.rigid import Resting, build
 from tests.operations import trace
 
-jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
 EDGE = (0.5, 0.5, 0.5)
 FRICTION, GRAVITY, TIMESTEP = 0.5, 9.81, 0.004
 FLOOR = f"""
@@ -60,7 +59,7 @@ def program(steps):
 
         return jax.lax.scan(one, now, length=steps)
 
-    return jit(run)
+    return jax.jit(run)
 
 
 def run(scene, now, steps=25, damage=0.0):
@@ -148,7 +147,7 @@ def test_a_rolling_ball_slows_down_by_the_resistance():
         after, _ = world.rollout(case, now, 100)
         return after.data.qpos[0] - now.data.qpos[0], after.data.qvel[0]
 
-    (way, speed), (slope, _) = jit(lambda x: jax.jvp(travel, (x,), (1.0,)))(1.0)
+    (way, speed), (slope, _) = jax.jit(lambda x: jax.jvp(travel, (x,), (1.0,)))(1.0)
     duration, loss = 100 * TIMESTEP, 0.1 * GRAVITY / size
     assert speed == pytest.approx(1 - loss * duration, rel=0.02)
     assert way == pytest.approx(duration - loss * duration**2 / 2, rel=0.02)

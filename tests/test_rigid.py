@@ -1,6 +1,5 @@
 """Scenes, slots, contacts and the solver, against MuJoCo and conservation laws."""
 
-import functools
 import inspect
 
 import jax
@@ -20,7 +19,6 @@ from blastjax.rigid import bodies, build, contact, engine, rows, solver
 EDGE = (0.5, 0.5, 0.5)
 
 # Compiling is what these tests cost, not running.
-jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
 PLANE_BOX = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_BOX)
 
 
@@ -151,7 +149,7 @@ def compare(monkeypatch, shape, cases, seconds):
     as_in_c.ncon = 4
     monkeypatch.setitem(collision_driver._COLLISION_FUNC, PLANE_BOX, as_in_c)
     monkeypatch.setattr(mjx_solver, "solve", polished)
-    ours, theirs = jit(jax.vmap(ours)), jit(jax.vmap(theirs))
+    ours, theirs = jax.jit(jax.vmap(ours)), jax.jit(jax.vmap(theirs))
     worlds = jax.vmap(placed)(poses, speeds)
     datas = jax.vmap(lambda q, v: data.replace(qpos=q, qvel=v))(poses, speeds)
     mine, other = [], []
@@ -217,7 +215,7 @@ def quantities(scene, moment):
     return total
 
 
-@jit
+@jax.jit
 def shatter(scene, moment, bonds):
     """Break bonds (B,) bool and regroup, without physics."""
     asset = scene.asset
@@ -311,7 +309,7 @@ def touching(scene, moment):
         data, found = contact.collide(scene, moment.bodies, model, data)
         return data._impl.contact, found
 
-    contacts, found = jit(find)(moment)
+    contacts, found = jax.jit(find)(moment)
     active = np.asarray(contacts.dist < contacts.includemargin)
     return contacts, active, found
 
@@ -488,7 +486,7 @@ def dense(problem):
 
 @pytest.mark.parametrize("kind", PROBLEMS)
 def test_solver_finds_the_minimum_of_equalities_friction_and_contacts(x64, kind):
-    solve = jit(solution)
+    solve = jax.jit(solution)
     for seed in range(3):
         problem = random_problem(seed, **PROBLEMS[kind])
         a, forces, pull, report = solve(problem)
@@ -525,7 +523,7 @@ def test_solver_has_forward_and_reverse_derivatives(x64, kind):
         a, forces, _, _ = solution(changed)
         return sum(jnp.sum(jnp.sin(x)) for x in jax.tree.leaves((a, forces)))
 
-    @jit
+    @jax.jit
     def slopes(h):
         near = [x + h * t for x, t in zip(values, tangents, strict=True)]
         value, forward = jax.jvp(answer, (near,), (tangents,))
@@ -556,7 +554,7 @@ def test_a_body_whose_inertia_lies_askew_tumbles_as_euler_says(x64, integrator):
     slot = scene.host.slot_body[0]
     data = start.data.replace(xfrc_applied=start.data.xfrc_applied.at[slot].set(push))
     data = data.replace(qvel=data.qvel.at[0].set(2.0))
-    moment, _ = jit(world.step)(scene, start.replace(data=data))
+    moment, _ = jax.jit(world.step)(scene, start.replace(data=data))
     change = (moment.data.qvel - data.qvel) / 0.001
     mass = float(asset.chunk_volume[0])
     turn = np.linalg.solve(inertia, push[3:] - np.cross(spin, inertia @ spin))
@@ -610,8 +608,8 @@ def test_canary_robots_move_as_mjx_moves_them(x64):
     user.option.iterations, user.option.tolerance = 50, 1e-15
     model = mjx.put_model(user.compile(), impl="jax")
     data = mjx.make_data(model).replace(ctrl=jnp.array([0.7]))
-    theirs = jit(mjx.step)
-    ours = jit(lambda w: world.step(scene, w, ctrl=jnp.array([0.7])))
+    theirs = jax.jit(mjx.step)
+    ours = jax.jit(lambda w: world.step(scene, w, ctrl=jnp.array([0.7])))
     moment = world.init(scene)
     for _ in range(150):
         data = theirs(model, data)
@@ -724,7 +722,7 @@ def test_the_users_own_meet_where_no_chunk_meets_anything():
         block((1, 1, 1)), model=model, position=(2.0, 0, 1.0), chunk_contacts=False
     )
     assert scene.host.chunk_sides == () and scene.host.user_meets
-    end, _ = jit(lambda w: world.rollout(scene, w, 50))(world.init(scene))
+    end, _ = jax.jit(lambda w: world.rollout(scene, w, 50))(world.init(scene))
     duration = 50 * scene.host.model.opt.timestep
     fallen = 1.25 - end.data.qpos[scene.host.slot_qpos[0, 2]]
     assert fallen == pytest.approx(9.81 * duration**2 / 2, rel=0.05)

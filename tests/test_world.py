@@ -1,7 +1,5 @@
 """Worlds: impact, splitting, grace, debris, transforms and derivatives of the step."""
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,7 +13,6 @@ from blastjax.rigid import bodies, build
 EDGE = (0.5, 0.5, 0.5)
 
 # Compiling is what these tests cost, not running.
-jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
 WEIGHT = 8 * 125.0 * 9.81
 
 
@@ -34,7 +31,7 @@ def rubble():
         start = world.init(scene)
         impact = world.Impact(1e9, 1.0, 0.2, 1.0)
 
-        @jit
+        @jax.jit
         def step(moment, bond, chunk):
             hit = Damage(bond=bond, chunk=chunk)
             return world.step(scene, moment, damage=hit, impact=impact)
@@ -157,7 +154,7 @@ def extremes():
 
         lanes = jnp.asarray(list(EXTREMES.values()), jnp.float32)
         moment = jax.tree.map(lambda *x: jnp.stack(x), *map(start, lanes))
-        moment, events, fastest = jit(jax.vmap(roll))(lanes, moment)
+        moment, events, fastest = jax.jit(jax.vmap(roll))(lanes, moment)
 
         def pick(tree, i):
             return jax.tree.map(lambda x: x[i], tree)
@@ -233,7 +230,7 @@ def wall():
             qvel = moment.data.qvel.at[0].set(-speed)
             return moment.replace(data=moment.data.replace(qvel=qvel))
 
-        return scene, start, jit(jax.vmap(step))
+        return scene, start, jax.jit(jax.vmap(step))
 
 
 def strike(wall, mass, speed, dt, health, seconds=0.15):
@@ -291,7 +288,7 @@ def tiny():
         impact = world.Impact(
             threshold=10.0, hardness=200.0, min_radius=0.1, max_radius=1.0
         )
-        step = jit(lambda w: world.step(scene, w, impact=impact))
+        step = jax.jit(lambda w: world.step(scene, w, impact=impact))
         return scene, impact, step
 
 
@@ -316,7 +313,7 @@ def test_scan_of_a_batch_is_a_loop_of_loops(tiny):
             lambda w, _: jax.vmap(step.__wrapped__)(w), start, None, length=5
         )[0]
 
-    close(jit(five)(together), jax.tree.map(lambda *x: jnp.stack(x), *apart), 1e-4)
+    close(jax.jit(five)(together), jax.tree.map(lambda *x: jnp.stack(x), *apart), 1e-4)
 
 
 @pytest.mark.slow
@@ -358,7 +355,7 @@ def test_derivative_of_a_rollout_is_its_difference_quotient():
             return place + seen[-1]
 
         push = np.array([0.0, 0.0, 0.0, 0.2, -0.1, 0.3])
-        both = jit(jax.value_and_grad(loss))
+        both = jax.jit(jax.value_and_grad(loss))
         slope = np.asarray(both(push)[1])
         assert np.isfinite(slope).all()
         assert np.abs(slope[2]) > 1e-3
@@ -409,7 +406,7 @@ def test_dead_pieces_leave_when_told_to():
     asset = scene.asset
     state, _ = fracture.apply(asset, start.state, Damage(bond=jnp.full(1, 2.0)))
     state, parted = fracture.split(asset, state)
-    regroup = jit(world._regroup, static_argnums=4)
+    regroup = jax.jit(world._regroup, static_argnums=4)
     moment, _ = regroup(scene, start, state, parted, True, 0)
     assert int(moment.debris.count) == 0
     state, _ = fracture.apply(asset, state, Damage(chunk=jnp.array([0.0, 2.0])))

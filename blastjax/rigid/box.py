@@ -6,15 +6,14 @@ in which they meet, four points of it; two edges give one point. The choice of f
 is piecewise constant; depth, place and normal are differentiable in poses and sizes
 between its jumps.
 
-Every number is an array of pairs, (P,) or (n, P), and vectors are tuples: only so a
-compiler for CPUs runs along the pairs with all its lanes, ten times faster than with
-rows of three numbers. What depends on a choice among three axes turns its tuples until
-the chosen one is the first. Everything is relative to one box of a pair, so nothing is
-lost far from the world's origin. Sizes: P pairs.
+Every number is an array with the pairs last, (P,) or (n, P), and vectors are (3, P):
+only so a compiler for CPUs runs along the pairs with all its lanes, ten times faster
+than with rows of three numbers. What depends on a choice among three axes turns them
+until the chosen one is the first. Everything is relative to one box of a pair, so
+nothing is lost far from the world's origin. Sizes: P pairs.
 """
 
 import functools
-import itertools
 from typing import Any, NamedTuple
 
 import jax
@@ -33,19 +32,16 @@ _SLOPE = (0.9e-4, 0.4e-4)
 _PARALLEL = 1e-6
 """Edges whose crossing has a smaller squared sine have no normal of their own."""
 
-Vector = tuple[jax.Array, ...]
-"""Its components, (P,) each."""
-
 
 class _Box(NamedTuple):
     """The first, or the second, box of each pair."""
 
-    place: Vector
-    """Its centre, m."""
-    axes: tuple[Vector, ...]
-    """Its three axes, of unit length."""
-    half: Vector
-    """Half extents along them, m."""
+    place: jax.Array
+    """(3, P) its centre, m."""
+    axes: jax.Array
+    """(3, 3, P) its three axes, of unit length, one after the other."""
+    half: jax.Array
+    """(3, P) half extents along them, m."""
 
 
 class _Choice(NamedTuple):
@@ -72,15 +68,14 @@ def box_box(model: mjx.Model, data: mjx.Data, pair: jax.Array) -> engine.Points:
     own, other = _once(_where(chosen.swap, (b, a), (a, b)))
     distance, point, outward = _face_contacts(own, other, chosen.axis, margin)
     gap, place, across = _edge_contact(a, b, chosen.edges)
-    single = jnp.full_like(distance, FAR).at[0].set(gap)
+    single = jnp.where(_number(POINTS) == 0, gap, FAR)
     by_edges = _prefers_edges(a, b, chosen, jax.lax.stop_gradient(distance))
     distance = jnp.where(by_edges, single, distance)
     point = jnp.where(by_edges, place[:, None], point)
     normal = jnp.where(by_edges, across, jnp.where(chosen.swap, -outward, outward))
-    axes = [x for axis in _frame(tuple(normal)) for x in axis]
     # From pairs last to pairs first, in one go.
-    rows = _once((*distance, *point.reshape(-1, len(pair)), *axes))
-    found = jnp.stack(rows).T
+    parts = distance, point.reshape(3 * POINTS, -1), _frame(normal)
+    found = jnp.concatenate(_once(parts)).T
     points = found[:, POINTS:-9].reshape(-1, 3, POINTS).transpose(0, 2, 1)
     frame = jnp.repeat(found[:, -9:].reshape(-1, 3, 3), POINTS, axis=0)
     return found[:, :POINTS].reshape(-1), points.reshape(-1, 3), frame
@@ -88,11 +83,7 @@ def box_box(model: mjx.Model, data: mjx.Data, pair: jax.Array) -> engine.Points:
 
 def _box(model: mjx.Model, data: mjx.Data, geom: jax.Array) -> _Box:
     axes = data.geom_xmat[geom].transpose(2, 1, 0)
-    return _Box(
-        place=tuple(data.geom_xpos[geom].T),
-        axes=tuple(tuple(axis) for axis in axes),
-        half=tuple(model.geom_size[geom].T),
-    )
+    return _Box(data.geom_xpos[geom].T, axes, model.geom_size[geom].T)
 
 
 _once = jax.lax.optimization_barrier
@@ -100,77 +91,74 @@ _once = jax.lax.optimization_barrier
 
 
 def _where(condition: jax.Array, yes: Any, no: Any) -> Any:
-    """Select between two trees of arrays (P,)."""
+    """Select between two trees of arrays by a condition (P,)."""
     return jax.tree.map(functools.partial(jnp.where, condition), yes, no)
 
 
-def _first(three: Any, chosen: jax.Array) -> Any:
-    """Turn a tuple of three until the chosen (P,) entry is the first."""
-    x, y, z = three
-    later = _where(chosen == 1, (y, z, x), (z, x, y))
-    return _where(chosen == 0, (x, y, z), later)
+def _turns(x: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Return x (3, ...) with its first, its second and its third entry in front."""
+    # Slices of one array: a loop over them has no branches.
+    around = _once(jnp.concatenate([x, x[:2]]))
+    return around[0:3], around[1:4], around[2:5]
 
 
-def _best(scores: Any) -> tuple[jax.Array, jax.Array]:
-    """Return the greatest of scores (P,), and which it is; the first of equal ones."""
-    stack = jnp.stack(_once(scores))
-    return jnp.max(stack, axis=0), jnp.argmax(stack, axis=0)
+def _first(x: jax.Array, chosen: jax.Array) -> jax.Array:
+    """Turn x (3, ..., P) until the chosen (P,) entry is the first."""
+    zero, one, two = _turns(x)
+    return jnp.where(chosen == 0, zero, jnp.where(chosen == 1, one, two))
 
 
-def _dot(a: Vector, b: Vector) -> jax.Array:
+def _number(count: int) -> jax.Array:
+    return jnp.arange(count)[:, None]
+
+
+def _best(scores: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return the greatest of scores (n, P), and which; the first of equal ones."""
+    scores = _once(scores)
+    return jnp.max(scores, axis=0), jnp.argmax(scores, axis=0)
+
+
+def _dot(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Return the products of vectors (3, ...)."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-def _add(a: Vector, b: Vector, times: jax.Array | float = 1.0) -> Vector:
-    """Return a + times b."""
-    return tuple(x + times * y for x, y in zip(a, b, strict=True))
 
 
 def _sign(x: jax.Array) -> jax.Array:
     return jnp.where(jax.lax.stop_gradient(x) < 0, -1.0, 1.0).astype(x.dtype)
 
 
-def _longest(box: _Box) -> jax.Array:
-    return jnp.maximum(jnp.maximum(box.half[0], box.half[1]), box.half[2])
-
-
-def _seen(own: _Box, other: _Box) -> tuple[Any, Vector]:
-    """Return the cosines of own axes (rows) with another's, and its centre, as seen."""
-    turn = tuple(tuple(_dot(x, y) for y in other.axes) for x in own.axes)
-    offset = _add(other.place, own.place, -1.0)
-    return turn, tuple(_dot(x, offset) for x in own.axes)
+def _seen(own: _Box, other: _Box) -> tuple[jax.Array, jax.Array]:
+    """Return how a box sees another: its axes (3 own, 3 of the other, P) and place."""
+    u, v = own.axes.swapaxes(0, 1), other.axes.swapaxes(0, 1)
+    turn = _dot(u[:, :, None], v[:, None])
+    return turn, _dot(u, (other.place - own.place)[:, None])
 
 
 def _choose(first: _Box, second: _Box) -> _Choice:
     """Find the axes of least overlap, of faces and of edges."""
     turn, shift = _once(_seen(first, second))
     a, b = first.half, second.half
-    lean = tuple(tuple(map(jnp.abs, row)) for row in turn)
-    size = _longest(first) + _longest(second)
-    gaps = [abs(shift[i]) - a[i] - _dot(lean[i], b) for i in range(3)]
-    for j, (cosine, leans) in enumerate(
-        zip(zip(*turn, strict=True), zip(*lean, strict=True), strict=True)
-    ):
-        gap = abs(_dot(cosine, shift)) - b[j] - _dot(leans, a)
-        # Between equal faces the first box's is taken, whatever the rounding.
-        gaps.append(gap - _ROUNDING * size)
-    face_gap, face = _best(gaps)
+    lean = abs(turn)
+    size = jnp.max(a, axis=0) + jnp.max(b, axis=0)
+    ours = abs(shift) - a - _dot(lean.swapaxes(0, 1), b[:, None])
+    theirs = abs(_dot(turn, shift[:, None])) - b - _dot(lean, a[:, None])
+    # Between equal faces the first box's is taken, whatever the rounding.
+    face_gap, face = _best(jnp.concatenate([ours, theirs - _ROUNDING * size]))
 
+    # Edge i of the first box and j of the second: (3, 3, P). Their normal is
+    # (0, -y, x), e_i x the second's axis, seen from the first.
+    _, x, y = _turns(turn)
+    (_, a1, a2), (_, s1, s2) = _turns(a[:, None]), _turns(shift[:, None])
+    _, b1, b2 = _turns(b[:, None])
+    _, lean1, lean2 = _turns(lean.swapaxes(0, 1))
+    reach = a1 * abs(y) + a2 * abs(x) + (b1 * lean2 + b2 * lean1).swapaxes(0, 1)
     # Close to parallel, rounding is most of what is left of a gap.
-    rounding = 4 * jnp.finfo(size.dtype).eps * size
-    gaps = []
-    for i, j in itertools.product(range(3), repeat=2):
-        i1, i2, j1, j2 = (i + 1) % 3, (i + 2) % 3, (j + 1) % 3, (j + 2) % 3
-        # The normal is (0, -y, x): e_i x the second's axis, seen from the first.
-        x, y = turn[i1][j], turn[i2][j]
-        reach = a[i1] * abs(y) + a[i2] * abs(x) + b[j1] * lean[i][j2]
-        reach = reach + b[j2] * lean[i][j1] + rounding
-        square = x * x + y * y
-        able = square > _PARALLEL
-        scale = jax.lax.rsqrt(jnp.where(able, square, 1.0))
-        gap = (abs(shift[i2] * x - shift[i1] * y) - reach) * scale
-        gaps.append(jnp.where(able, gap, -jnp.inf))
-    edge_gap, edge = _best(gaps)
+    reach = reach + 4 * jnp.finfo(size.dtype).eps * size
+    square = x * x + y * y
+    able = square > _PARALLEL
+    scale = jax.lax.rsqrt(jnp.where(able, square, 1.0))
+    gap = jnp.where(able, (abs(s2 * x - s1 * y) - reach) * scale, -jnp.inf)
+    edge_gap, edge = _best(gap.reshape(9, -1))
     return _Choice(
         swap=face > 2,
         axis=jnp.where(face > 2, face - 3, face),
@@ -186,7 +174,8 @@ def _prefers_edges(a: _Box, b: _Box, chosen: _Choice, distance: jax.Array) -> ja
     Than the axis of the face, and than all points in which the faces meet: these may be
     no deeper than the edges where a corner elsewhere is.
     """
-    long_a, long_b = jax.lax.stop_gradient((_longest(a), _longest(b)))
+    sizes = jax.lax.stop_gradient((a.half, b.half))
+    long_a, long_b = (jnp.max(x, axis=0) for x in sizes)
     slack, slop = _ROUNDING * (long_a + long_b), FACE_SLOP * jnp.minimum(long_a, long_b)
     edge, face = chosen.edge_gap, chosen.face_gap
     crossing = edge * jnp.where(edge < 0, 1 / FACE_BIAS, FACE_BIAS)
@@ -209,122 +198,101 @@ def _face_contacts(
     """
     turn, shift = _seen(own, other)
     # The normal first, then two directions across.
-    turn, shift, half = (_first(x, axis) for x in (turn, shift, own.half))
-    frame = _first(own.axes, axis)
-    turn, shift, half, frame = _once((turn, shift, half, frame))
-    side = _sign(shift[0])
-    heights = [jax.lax.stop_gradient(abs(x)) for x in turn[0]]
-    _, facing = _best(heights)
-    # From the other's centre to its lowest corner.
-    arms = []
-    for cosine, length in zip(zip(*turn, strict=True), other.half, strict=True):
-        down = -_sign(side * cosine[0]) * length
-        arms.append((down * side * cosine[0], down * cosine[1], down * cosine[2]))
-    down, p, q = _first(tuple(arms), facing)
-    center = _add((side * shift[0] - half[0], *shift[1:]), down)
-    center, p, q = _once((center, p, q))
-    lowest = _add(_add(center, p), q)
-    corners, real = _meeting(center, p, q, half)
-    kept = _outline(corners, real & (corners[0] < margin))
-    none = ~kept[0][0]
-    kept[0] = _where(none, (~none | none, lowest), kept[0])
-
-    real = jnp.stack([x for x, _ in kept])
-    height, x, y = (jnp.stack(z) for z in zip(*(z for _, z in kept), strict=True))
-    middle = side * (half[0] + 0.5 * height)
-    point = jnp.stack(
-        [
-            c + middle * u + x * v + y * w
-            for c, u, v, w in zip(own.place, *frame, strict=True)
-        ]
+    turn, shift, half, frame = _once(
+        tuple(_first(x, axis) for x in (turn, shift, own.half, own.axes))
     )
-    outward = jnp.stack([side * u for u in frame[0]])
-    return jnp.where(real, height, FAR), point, outward
+    side = _sign(shift[0])
+    _, facing = _best(jax.lax.stop_gradient(abs(turn[0])))
+    # Heights are outward, whichever of the two faces it is.
+    outward = jnp.where(_number(3) == 0, side, 1.0)
+    turn = turn * outward[:, None]
+    # From the other's centre to its lowest corner, an axis at a time.
+    arms = (-_sign(turn[0]) * other.half)[:, None] * turn.swapaxes(0, 1)
+    down, p, q = _first(arms, facing)
+    center = shift * outward + down - jnp.where(_number(3) == 0, half, 0.0)
+    center, p, q = _once((center, p, q))
+    corners, real = _meeting(center, p, q, half)
+    counts, kept = _outline(corners, real & (corners[0] < margin))
+    alone = ~counts[0] & (_number(POINTS) == 0)
+    counts, kept = counts | alone, jnp.where(alone, (center + p + q)[:, None], kept)
+    height, normal = kept[0], side * frame[0]
+    point = normal[:, None] * (half[0] + 0.5 * height)
+    point = point + frame[1][:, None] * kept[1] + frame[2][:, None] * kept[2]
+    return jnp.where(counts, height, FAR), own.place[:, None] + point, normal
 
 
 def _meeting(
-    center: Vector, p: Vector, q: Vector, half: Vector
-) -> tuple[Vector, jax.Array]:
+    center: jax.Array, p: jax.Array, q: jax.Array, half: jax.Array
+) -> tuple[jax.Array, jax.Array]:
     """Return the corners of where two faces meet.
 
     Args:
-      center: of one face: its height over the other one, and where it is across, m.
-      p: from there to the middle of a side, m.
-      q: from there to the middle of the next side, m.
-      half: (_, x, y) half extents of the other face across, m.
+      center: (3, P) of one face: its height over the other one, and where across, m.
+      p: (3, P) from there to the middle of a side, m.
+      q: (3, P) from there to the middle of the next side, m.
+      half: (3, P) half extents of the other face; the first is not read, m.
 
     Returns:
-      Twelve points, (12, P) a component, and which of them are there, (12, P).
+      Twelve points, (3, 12, P), and which of them are there, (12, P).
     """
-    along = [jnp.stack([x, x, y, y]) for x, y in zip(p, q, strict=True)]
-    middle = [
-        jnp.stack([z + y, z - y, z + x, z - x])
-        for x, y, z in zip(p, q, center, strict=True)
-    ]
-    low, high = -jnp.ones_like(middle[0]), jnp.ones_like(middle[0])
-    real = jnp.ones_like(low, bool)
-    for limit, place, way in zip(half[1:], middle[1:], along[1:], strict=True):
-        # What hardly moves across two sides is between them or not.
-        crosses = abs(way) > 1e-9 * limit
-        slope = 1 / jnp.where(crosses, way, 1.0)
-        reach = jnp.where(crosses, limit * abs(slope), 2.0)
-        between = jnp.where(crosses, -place * slope, 0.0)
-        real &= crosses | (abs(place) <= limit)
-        low = jnp.maximum(low, between - reach)
-        high = jnp.minimum(high, between + reach)
-    real &= low <= high
+    along = jnp.stack([p, p, q, q], axis=1)
+    middle = center[:, None] + jnp.stack([q, -q, p, -p], axis=1)
+    # What hardly moves across two sides is between them or not. (2, 4, P)
+    limit, way, place = half[1:, None], along[1:], middle[1:]
+    crosses = abs(way) > 1e-9 * limit
+    slope = 1 / jnp.where(crosses, way, 1.0)
+    reach = jnp.where(crosses, limit * abs(slope), 2.0)
+    between = jnp.where(crosses, -place * slope, 0.0)
+    low, high = _once((between - reach, between + reach))
+    low = jnp.maximum(jnp.maximum(low[0], low[1]), -1.0)
+    high = jnp.minimum(jnp.minimum(high[0], high[1]), 1.0)
+    inside = crosses | (abs(place) <= limit)
+    real = inside[0] & inside[1] & (low <= high)
     low, high = jnp.clip(low, -1.0, 1.0), jnp.clip(high, -1.0, 1.0)
 
-    corner = [
-        jnp.stack([x, x, -x, -x]) if k else jnp.stack([x, -x, x, -x])
-        for k, x in enumerate(half[1:])
-    ]
-    x, y = corner[0] - center[1], corner[1] - center[2]
+    x, y = half[1], half[2]
+    corner = jnp.stack([jnp.stack([x, x, -x, -x]), jnp.stack([y, -y, y, -y])])
+    x, y = corner - center[1:, None]
     area = 1 / (p[1] * q[2] - p[2] * q[1])
     s, t = (x * q[2] - y * q[1]) * area, (p[1] * y - p[2] * x) * area
     # A corner on a corner is within at least one of the two faces.
     within = jnp.maximum(abs(s), abs(t)) <= 1 + _ROUNDING
-    corner = [center[0] + s * p[0] + t * q[0], *corner]
-    points = tuple(
-        jnp.concatenate([m + low * w, m + high * w, c])
-        for m, w, c in zip(middle, along, corner, strict=True)
-    )
-    return points, jnp.concatenate([real, real, within])
+    height = center[0] + s * p[0] + t * q[0]
+    corner = jnp.concatenate([height[None], corner])
+    points = [middle + low * along, middle + high * along, corner]
+    return jnp.concatenate(points, axis=1), jnp.concatenate([real, real, within])
 
 
-def _outline(points: Vector, real: jax.Array) -> list[tuple[jax.Array, Vector]]:
-    """Choose the deepest point of n that are real, and three that span most with it.
+def _outline(points: jax.Array, real: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Choose the deepest point of n (3, n, P) that are real, and three that span most.
 
     Returns:
-      Each, and whether it counts, (P,): what coincides with another one, or lies
-      between two, does not.
+      Which of them count, (4, P): what coincides with another one, or lies between two,
+      does not; and the points, (3, 4, P).
     """
+    points, real = _once((points, real))
     still = jax.lax.stop_gradient(points)
-    number = jnp.arange(real.shape[0])[:, None]
+    number = _number(real.shape[0])
 
-    def best(score: jax.Array) -> tuple[jax.Array, Vector]:
-        score = jnp.where(real, score, -jnp.inf)
-        mask = number == jnp.argmax(score, axis=0)
+    def best(score: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        score, chosen = _best(jnp.where(real, score, -jnp.inf))
         # A sum of one is a gather that runs along the pairs.
-        point = tuple(jnp.sum(jnp.where(mask, x, 0.0), axis=0) for x in points)
-        return jnp.max(score, axis=0), point
+        point = jnp.sum(jnp.where(number == chosen, points, 0.0), axis=1)
+        return score, point, jax.lax.stop_gradient(point)[:, None]
 
-    def area(start: Vector, end: Vector, x: Vector) -> jax.Array:
-        along, away = _add(end, start, -1.0), _add(x, start, -1.0)
+    def area(start: jax.Array, end: jax.Array, x: jax.Array) -> jax.Array:
+        along, away = end - start, x - start
         return along[1] * away[2] - along[2] * away[1]
 
-    deepest, one = best(_SLOPE[0] * still[1] + _SLOPE[1] * still[2] - still[0])
-    a = jax.lax.stop_gradient(one)
-    square, two = best((still[1] - a[1]) ** 2 + (still[2] - a[2]) ** 2)
-    b = jax.lax.stop_gradient(two)
-    width, three = best(abs(area(a, b, still)))
-    c = jax.lax.stop_gradient(three)
+    deepest, one, a = best(_SLOPE[0] * still[1] + _SLOPE[1] * still[2] - still[0])
+    square, two, b = best((still[1] - a[1]) ** 2 + (still[2] - a[2]) ** 2)
+    width, three, c = best(abs(area(a, b, still)))
     around = _sign(area(a, b, c))
     sides = area(b, a, still), area(c, b, still), area(a, c, still)
-    more, four = best(functools.reduce(jnp.maximum, [around * x for x in sides]))
+    more, four = best(functools.reduce(jnp.maximum, [around * x for x in sides]))[:2]
     least = _ROUNDING * square
     counts = deepest > -jnp.inf, square > 0, width > least, more > least
-    return list(zip(counts, (one, two, three, four), strict=True))
+    return jnp.stack(counts), jnp.stack([one, two, three, four], axis=1)
 
 
 def _edge_contact(
@@ -332,10 +300,11 @@ def _edge_contact(
 ) -> engine.Points:
     """Return gap (P,), middle (3, P) and normal (3, P) of where edges cross."""
     turn, shift = _seen(first, second)
-    turn, shift, a = (_first(x, edges[0]) for x in (turn, shift, first.half))
-    columns = _first(tuple(zip(*turn, strict=True)), edges[1])
-    columns, shift, a = _once((columns, shift, a))
-    b, frame = _first(second.half, edges[1]), _first(first.axes, edges[0])
+    turn, shift, a, frame = _once(
+        tuple(_first(x, edges[0]) for x in (turn, shift, first.half, first.axes))
+    )
+    columns, b = (_first(x, edges[1]) for x in (turn.swapaxes(0, 1), second.half))
+    columns, b = _once((columns, b))
     # The first box's edge runs along x, the second's along r; (0, y, z) is normal.
     r = columns[0]
     square = r[1] * r[1] + r[2] * r[2]
@@ -344,32 +313,30 @@ def _edge_contact(
     scale = jax.lax.rsqrt(square) * _sign(shift[2] * r[1] - shift[1] * r[2])
     y, z = -r[2] * scale, r[1] * scale
     # Both edges are where their boxes reach furthest towards each other.
-    end = shift
-    for k in (1, 2):
-        reach = _sign(y * columns[k][1] + z * columns[k][2]) * b[k]
-        end = _add(end, columns[k], -reach)
-    start = jnp.zeros_like(y), _sign(y) * a[1], _sign(z) * a[2]
-    offset = _add(end, start, -1.0)
+    reach = _sign(y * columns[1:, 1] + z * columns[1:, 2]) * b[1:]
+    end = shift - columns[1] * reach[0] - columns[2] * reach[1]
+    normal = jnp.stack([jnp.zeros_like(y), y, z])
+    start = jnp.where(_number(3) == 0, 0.0, _sign(normal) * a)
+    offset = end - start
     gap = offset[1] * y + offset[2] * z
     on_second = -(offset[1] * r[1] + offset[2] * r[2]) / square
     on_second = jnp.clip(on_second, -b[0], b[0])
     on_first = jnp.clip(offset[0] + on_second * r[0], -a[0], a[0])
-    middle = _add(_add(end, r, on_second), (on_first, *start[1:]))
+    start = start + jnp.where(_number(3) == 0, on_first, 0.0)
+    middle = 0.5 * (end + start + on_second * r)
     middle, y, z = _once((middle, y, z))
-    point = first.place
-    for axis, part in zip(frame, middle, strict=True):
-        point = _add(point, axis, 0.5 * part)
-    normal = [y * u + z * v for u, v in zip(*frame[1:], strict=True)]
-    return gap, jnp.stack(point), jnp.stack(normal)
+    point = first.place + _dot(frame, middle[:, None])
+    return gap, point, y * frame[1] + z * frame[2]
 
 
-def _frame(normal: Vector) -> tuple[Vector, Vector, Vector]:
-    """Return the axes of contacts, as MuJoCo completes a normal (3,) to them."""
-    upright = abs(jax.lax.stop_gradient(normal[1])) >= 0.5
-    one, zero = jnp.ones_like(normal[0]), jnp.zeros_like(normal[0])
-    away = _where(upright, (zero, zero, one), (zero, one, zero))
-    first = _add(away, normal, -_dot(away, normal))
-    scale = jax.lax.rsqrt(_dot(first, first))
-    first = tuple(x * scale for x in first)
-    (x, y, z), (u, v, w) = normal, first
-    return normal, first, (y * w - z * v, z * u - x * w, x * v - y * u)
+def _frame(normal: jax.Array) -> jax.Array:
+    """Return the axes of contacts, (9, P), as MuJoCo completes a normal (3, P)."""
+    x, y, z = normal
+    upright = abs(jax.lax.stop_gradient(y)) >= 0.5
+    # What is left of e_z or e_y beside the normal.
+    away = jnp.where(upright, z, y)
+    first = jnp.where(_number(3) == jnp.where(upright, 2, 1), 1.0, 0.0) - away * normal
+    first = first * jax.lax.rsqrt(_dot(first, first))
+    u, v, w = first
+    second = jnp.stack([y * w - z * v, z * u - x * w, x * v - y * u])
+    return jnp.concatenate([normal, first, second])
