@@ -10,6 +10,7 @@ of the nodes follows the way, and a few pairs of sweeps are enough.
 Nodes are visited in an order of their own; labels are node numbers all the same.
 """
 
+import functools
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -399,13 +400,19 @@ def _settle(
 
 def _total(rows: jax.Array) -> jax.Array:
     """Sum up each column; of labels below 2^32, so it falls whenever a label falls."""
+    num_nodes = rows.shape[0] - GROUP
+    # So many labels add up to 16 bits. The last few may count twice.
+    some = min(32, LIMIT // num_nodes, num_nodes)
 
     def add(i: jax.Array, total: jax.Array) -> jax.Array:
-        return total + _group(rows, i * GROUP).astype(jnp.uint32)
+        start = i * some, jnp.uint32(0)
+        part = lax.dynamic_slice(rows, start, (some, rows.shape[1]))
+        parts = (part[j].astype(jnp.uint16) for j in range(some))
+        return total + functools.reduce(jnp.add, parts).astype(jnp.uint32)
 
-    start = jnp.zeros((GROUP, rows.shape[1]), jnp.uint32)
-    count = jnp.uint32(rows.shape[0] // GROUP)
-    return lax.fori_loop(jnp.uint32(0), count, add, start).sum(axis=0)
+    count = jnp.uint32(-(-num_nodes // some))
+    start = jnp.zeros(rows.shape[1], jnp.uint32)
+    return lax.fori_loop(jnp.uint32(0), count, add, start)
 
 
 def touched(way: Order, flags: jax.Array) -> jax.Array:
