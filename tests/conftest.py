@@ -4,17 +4,8 @@ import importlib.metadata
 import os
 import pathlib
 
-import pytest
-
-if "XLA_FLAGS" not in os.environ:
-    # Tests ask what programs compute, once, and compiling them is most of their cost.
-    flags = ["--xla_backend_optimization_level=0"]
-    if importlib.metadata.version("jaxlib").startswith("0.10."):
-        # A way of compiling that is three times faster, and was removed since.
-        flags.append("--xla_cpu_use_fusion_emitters=false")
-    os.environ["XLA_FLAGS"] = " ".join(flags)
-
 import jax
+import pytest
 
 CORES = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else None
 """What this process may run on, before any test module is loaded."""
@@ -23,6 +14,22 @@ CACHE = pathlib.Path(__file__).parent.parent / ".pytest_cache" / "compiled"
 # Compilations are most of the cost of these tests; another run need not repeat them.
 jax.config.update("jax_compilation_cache_dir", os.fspath(CACHE))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+
+
+def pytest_configure(config):
+    """Compile quickly: most tests ask once what a program computes.
+
+    What is slow runs for longer than it compiles, as users would compile it; so does
+    everything where XLA_FLAGS is set, to nothing for example.
+    """
+    if config.option.markexpr != "not slow" or "XLA_FLAGS" in os.environ:
+        return
+    # XLA reads them when it is first used, which is later than this.
+    flags = ["--xla_backend_optimization_level=0"]
+    if importlib.metadata.version("jaxlib").startswith("0.10."):
+        # A way of compiling that is three times faster, and was removed since.
+        flags.append("--xla_cpu_use_fusion_emitters=false")
+    os.environ["XLA_FLAGS"] = " ".join(flags)
 
 
 @pytest.fixture
