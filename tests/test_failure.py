@@ -16,8 +16,6 @@ G = 9.81
 BRICK = 1000.0 * 0.5**3 * G
 NEVER = 1e12
 
-# Compiling is what these tests cost, not running.
-
 
 @pytest.fixture(autouse=True)
 def careful(strict):

@@ -17,8 +17,6 @@ from blastjax.core import UNBREAKABLE, Damage
 from blastjax.rigid import bodies, build, contact, engine, rows, solver
 
 EDGE = (0.5, 0.5, 0.5)
-
-# Compiling is what these tests cost, not running.
 PLANE_BOX = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_BOX)
 
 

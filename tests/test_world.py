@@ -11,8 +11,6 @@ from blastjax.core import Damage
 from blastjax.rigid import bodies, build
 
 EDGE = (0.5, 0.5, 0.5)
-
-# Compiling is what these tests cost, not running.
 WEIGHT = 8 * 125.0 * 9.81
 
 
