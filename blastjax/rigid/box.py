@@ -109,6 +109,7 @@ def _first(x: jax.Array, chosen: jax.Array) -> jax.Array:
 
 
 def _number(count: int) -> jax.Array:
+    """Number rows of pairs from 0, (count, 1)."""
     return jnp.arange(count)[:, None]
 
 
