@@ -8,7 +8,7 @@ state when asked, nothing is stored.
 import jax
 import jax.numpy as jnp
 
-from blastjax import graph, pytree, sums
+from blastjax import graph, lanes, pytree, sums
 from blastjax.core import NONE, Asset, State
 
 
@@ -156,18 +156,25 @@ def _small(actor: jax.Array) -> jax.Array:
 def _owner(
     element: jax.Array, span: jax.Array, node: jax.Array, actor: jax.Array
 ) -> jax.Array:
-    """Return the owners of chunks, by the elements' actors (A,)."""
-    direct = _take(actor, element, NONE)
+    """Return the owners of chunks (C, T), by the elements' actors (A, T)."""
+    none = jnp.asarray(NONE, actor.dtype)
+    direct = _rows(actor, element)
     # In depth-first order a subtree is a range: it has one owner if no neighbours in
-    # the range differ, which a running count of differences tells.
-    label = jax.lax.optimization_barrier(actor[node])
-    differs = label[1:] != label[:-1]
-    count = jnp.pad(graph.running_count(differs), (1, 0))
+    # the range differ, which a running count of changes tells. Behind barriers, or XLA
+    # computes anew what is looked up, for each that looks.
+    label = jax.lax.optimization_barrier(_rows(actor, node))
+    count = jax.lax.optimization_barrier(graph.running_count(label))
     first = span[:, 0]
     last = jnp.maximum(span[:, 1] - 1, first)
-    one = (span[:, 1] > first) & (count[last] == count[first])
-    whole = jnp.where(one, label[first], jnp.asarray(NONE, actor.dtype))
-    return jnp.where(element < 0, whole, direct)
+    one = (span[:, 1] > first)[:, None] & (_rows(count, last) == _rows(count, first))
+    whole = jnp.where(one, _rows(label, first), none)
+    return jnp.where((element < 0)[:, None], whole, direct)
+
+
+def _rows(values: jax.Array, index: jax.Array) -> jax.Array:
+    """Return rows of values (n, T) by index; the first where that is negative."""
+    # Unsigned, it is not checked for counting from the end.
+    return lanes.take_rows(values, jnp.maximum(index, 0).astype(jnp.uint32))
 
 
 def _visible(
@@ -177,10 +184,10 @@ def _visible(
     parent: jax.Array,
     actor: jax.Array,
 ) -> jax.Array:
-    """Return which chunks are visible, by the elements' actors (A,)."""
-    # Behind a barrier, or XLA computes the owner anew for each chunk that asks for it.
+    """Return which chunks are visible (C, T), by the elements' actors (A, T)."""
     owner = jax.lax.optimization_barrier(_owner(element, span, node, actor))
-    return (owner != NONE) & (_take(owner, parent, NONE) != owner)
+    above = jnp.where((parent >= 0)[:, None], _rows(owner, parent), NONE)
+    return (owner != NONE) & (above != owner)
 
 
 def visible(asset: Asset, state: State) -> jax.Array:

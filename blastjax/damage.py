@@ -331,6 +331,13 @@ def _distance(points: jax.Array, position: jax.Array) -> jax.Array:
     return spatial.norm(_rows(position, points) - points)
 
 
+def _by_axis(points: jax.Array) -> jax.Array:
+    """Return points (n, 3), in memory axis by axis: a batch reads them in vectors."""
+    # Flat, for XLA would choose another layout.
+    flat = jax.lax.optimization_barrier(points.T.reshape(-1))
+    return flat.reshape(3, -1).T
+
+
 def _falloff(
     asset: Asset, amount: Scalar, min_radius: Scalar, max_radius: Scalar
 ) -> Profile:
@@ -353,9 +360,10 @@ def _radial(
     actors: jax.Array | None,
 ) -> Damage:
     centroid = chunks.element_values(asset, asset.chunk_centroid)
+    bond, chunk = map(_by_axis, (asset.bond_centroid, centroid))
     dealt = Damage(
-        bond=_on_bonds(state, profile(distance(asset.bond_centroid))),
-        chunk=_on_chunks(asset, state, profile(distance(centroid))),
+        bond=_on_bonds(state, profile(distance(bond))),
+        chunk=_on_chunks(asset, state, profile(distance(chunk))),
     )
     return dealt if actors is None else restrict(asset, state, dealt, actors)
 

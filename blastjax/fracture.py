@@ -58,7 +58,10 @@ def init(
     dtype = asset.chunk_centroid.dtype
     num_nodes, capacity = asset.span_node.shape[0], asset.element_chunk.shape[0]
     num_bonds = asset.bond_nodes.shape[0]
-    real_bond = asset.bond_nodes[:, 0] != asset.bond_nodes[:, 1]
+    # Behind barriers, or every body of a batch finds out anew.
+    real_bond = jax.lax.optimization_barrier(
+        asset.bond_nodes[:, 0] != asset.bond_nodes[:, 1]
+    )
     real_chunk = chunks.is_chunk(asset)
 
     bond = _health("bond_health", bond_health, dtype, (num_bonds,))
@@ -152,6 +155,8 @@ def _apply_to_chunks(
     num_nodes = asset.span_node.shape[0]
     damageable = _damageable(state.chunk_health, state.chunk_unbreakable)
     hit = (damage > 0) & damageable & (state.actor != NONE) & chunks.is_chunk(asset)
+    taken = jnp.where(hit, damage, 0)
+    hit = taken > 0
 
     if asset.bond_nodes.shape[0]:
         count = chunks.node_count(asset, state)[jnp.maximum(state.actor, 0)]
@@ -167,7 +172,6 @@ def _apply_to_chunks(
             dirty=dirty,
         )
 
-    taken = jnp.where(hit, damage, 0)
     health = state.chunk_health - taken
     excess = jnp.where(hit & (health < 0), -health, 0)
     if asset.depth == 0:
@@ -228,10 +232,9 @@ def _apply_to_bonds(
     asset: Asset, state: State, damage: jax.Array, marks: bool
 ) -> tuple[State, jax.Array]:
     damageable = _damageable(state.bond_health, state.bond_unbreakable)
-    hit = (damage > 0) & damageable
-    taken = jnp.where(hit, damage, 0)
+    taken = jnp.where((damage > 0) & damageable, damage, 0)
     left = state.bond_health - taken
-    broken = hit & (left <= 0)
+    broken = (taken > 0) & (left <= 0)
     state = state.replace(
         bond_health=jnp.where(broken, 0, left),
         bond_intact=state.bond_intact & ~broken,

@@ -88,24 +88,24 @@ def _hook_and_jump(edges: jax.Array, alive: jax.Array, num_nodes: int) -> jax.Ar
 
 @functools.cache
 def side_by_side(
-    one: Kernel, num_tables: int, dtype: jax.typing.DTypeLike = jnp.int32
+    tile: Kernel, num_tables: int, dtype: jax.typing.DTypeLike = jnp.int32
 ) -> Kernel:
-    """Return the same function, which a batch of states computes in lanes.
+    """Return a function of one state that is computed in lanes, as batches are.
 
     Args:
-      one: of `num_tables` arrays that describe the asset, and arrays (n,) of a state.
-        Constant under differentiation.
+      tile: of `num_tables` arrays that describe the asset, and arrays (n, T) of T
+        states of it, to (m, T). Constant under differentiation.
       num_tables: so many arguments all states share.
       dtype: of the result.
     """
 
     def rounds(*args: jax.Array) -> jax.Array:
-        return one(*args).astype(dtype)
+        tables, state = args[:num_tables], args[num_tables:]
+        return tile(*tables, *[x[:, None] for x in state])[:, 0].astype(dtype)
 
     def sweeps(*args: jax.Array) -> jax.Array:
         tables, states = args[:num_tables], args[num_tables:]
-        tile = jax.vmap(functools.partial(one, *tables), in_axes=-1, out_axes=-1)
-        return lanes.tiled(tile, dtype, *states)
+        return lanes.tiled(functools.partial(tile, *tables), dtype, *states)
 
     return one_of_many(rounds, sweeps, num_tables)
 
@@ -297,26 +297,35 @@ def _(
     return value, jnp.where(edge >= 0, tangents[2][jnp.maximum(edge, 0)], 0)
 
 
-def running_count(flags: jax.Array) -> jax.Array:
-    """Count the flags (n,) up to each, itself included: (n,) integers.
+def running_count(label: jax.Array) -> jax.Array:
+    """Count the changes down each column (n, T) to each row: (n, T) integers.
 
     Piecewise constant: no derivative passes.
     """
-    fits = flags.shape[0] <= jnp.iinfo(jnp.int16).max
-    dtype = jnp.int16 if fits else jnp.int32
+    size, width = label.shape
+    dtype = jnp.int16 if size <= jnp.iinfo(jnp.int16).max else jnp.int32
 
-    def add(count: jax.Array, flag: jax.Array) -> tuple[jax.Array, jax.Array]:
-        count = count + flag.astype(dtype)
-        return count, count
-
-    def walk(flags: jax.Array) -> jax.Array:
+    def walk(label: jax.Array) -> jax.Array:
         # On a CPU one pass, of whole rows where there are lanes.
-        return jax.lax.scan(add, jnp.zeros((), dtype), flags)[1]
+        def row(i: jax.Array) -> jax.Array:
+            return jax.lax.dynamic_slice(label, (i, jnp.uint32(0)), (1, width))
 
-    def whole(flags: jax.Array) -> jax.Array:
-        return jnp.cumsum(flags, dtype=dtype)
+        def add(
+            i: jax.Array, carry: tuple[jax.Array, jax.Array]
+        ) -> tuple[jax.Array, jax.Array]:
+            count, counts = carry
+            count = count + (row(i) != row(i - 1)).astype(dtype)
+            put = jax.lax.dynamic_update_slice(counts, count, (i, jnp.uint32(0)))
+            return count, put
 
-    return jax.lax.platform_dependent(flags, cpu=walk, default=whole)
+        start = jnp.zeros((1, width), dtype), jnp.zeros((size, width), dtype)
+        return jax.lax.fori_loop(jnp.uint32(1), jnp.uint32(size), add, start)[1]
+
+    def whole(label: jax.Array) -> jax.Array:
+        differs = jnp.pad(label[1:] != label[:-1], ((1, 0), (0, 0)))
+        return jnp.cumsum(differs, axis=0, dtype=dtype)
+
+    return jax.lax.platform_dependent(label, cpu=walk, default=whole)
 
 
 def group_sum(values: jax.Array, group: jax.Array, num_groups: int) -> jax.Array:
@@ -411,12 +420,14 @@ def group_count(group: jax.Array, num_groups: int) -> jax.Array:
 def _scattered(num_groups: int, kind: type) -> Kernel:
     """Return the scatter of flags (n,) to groups (n,): any of them, or how many."""
 
+    def put(size: int, place: jax.Array) -> jax.Array:
+        if kind is bool:
+            return jnp.zeros(size, bool).at[place].set(True, mode="drop")
+        return jnp.zeros(size, jnp.int32).at[place].add(1, mode="drop")
+
     def one(flags: jax.Array, group: jax.Array) -> jax.Array:
         # Negative numbers would count from the end; out of range, they are dropped.
-        group = jnp.where(flags & (group >= 0), group, num_groups)
-        if kind is bool:
-            return jnp.zeros(num_groups, bool).at[group].set(True, mode="drop")
-        return jnp.zeros(num_groups, jnp.int32).at[group].add(1, mode="drop")
+        return put(num_groups, jnp.where(flags & (group >= 0), group, num_groups))
 
     scatter = jax.custom_batching.custom_vmap(one)
 
@@ -427,12 +438,14 @@ def _scattered(num_groups: int, kind: type) -> Kernel:
         flags, group = _full(size, is_batched, args)
         if size * num_groups > jnp.iinfo(jnp.int32).max:
             return jax.vmap(one)(flags, group), True
-        # One scatter of all, several times faster than a batch of them.
+        # One scatter of all, several times faster than a batch of them. Behind a
+        # barrier, or its places are computed in the order of the scatter: not in
+        # vectors. Unsigned, they are not checked for counting from the end.
+        everything = size * num_groups
         copy = jnp.arange(size, dtype=jnp.int32)[:, None]
-        within = (group >= 0) & (group < num_groups)
-        group = jnp.where(within, copy * num_groups + group, -1)
-        of_all = _scattered(size * num_groups, kind)
-        found = of_all(flags.reshape(-1), group.reshape(-1))
-        return found.reshape(size, num_groups), True
+        within = flags & (group >= 0) & (group < num_groups)
+        place = jnp.where(within, copy * num_groups + group, everything)
+        place = jax.lax.optimization_barrier(place.astype(jnp.uint32)).reshape(-1)
+        return put(everything, place).reshape(size, num_groups), True
 
     return scatter

@@ -459,8 +459,10 @@ def tiled(
         x = jnp.pad(x, ((0, tiles * width - size), (0, 0)))
         return x.reshape(tiles, width, -1)
 
+    # Behind a barrier, or each block that is turned would compute its part of them.
+    tiles_of = lax.optimization_barrier(tuple(map(split, copies)))
     # Not a vmap: every tile stops when it is done.
-    found = lax.map(lambda x: tile(*map(_to_lanes, x)), tuple(map(split, copies)))
+    found = lax.map(lambda x: tile(*map(_to_lanes, x)), tiles_of)
 
     def join(x: jax.Array) -> jax.Array:
         x = x.swapaxes(1, 2).astype(dtype or x.dtype)
