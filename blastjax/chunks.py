@@ -163,7 +163,7 @@ def _owner(
     # the range differ, which a running count of changes tells. Behind barriers, or XLA
     # computes anew what is looked up, for each that looks.
     label = jax.lax.optimization_barrier(_rows(actor, node))
-    count = jax.lax.optimization_barrier(graph.running_count(label))
+    count = jax.lax.optimization_barrier(graph.count_changes(label))
     first = span[:, 0]
     last = jnp.maximum(span[:, 1] - 1, first)
     one = (span[:, 1] > first)[:, None] & (_rows(count, last) == _rows(count, first))

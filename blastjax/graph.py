@@ -70,20 +70,30 @@ def _search_islands(num_nodes: int) -> Kernel:
 
 
 def _hook_and_jump(edges: jax.Array, alive: jax.Array, num_nodes: int) -> jax.Array:
-    first, second = edges[:, 0], edges[:, 1]
-    nodes = jnp.arange(num_nodes, dtype=jnp.int32)
+    # Unsigned: such an index is not checked for counting from the end.
+    ends = edges.T.reshape(-1).astype(jnp.uint32)
 
     def hook(carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        label, _ = carry
-        a, b = label[first], label[second]
+        label, (a, b) = carry
         low = jnp.where(alive, jnp.minimum(a, b), num_nodes)
-        new = label.at[jnp.maximum(a, b)].min(low)
-        new = new[new]
-        new = new[new]
-        return new, jnp.any(new != label)
+        label = label.at[jnp.maximum(a, b)].min(low, mode="promise_in_bounds")
+        label = _at(label, label)
+        label = _at(label, label)
+        return label, _at(label, ends).reshape(2, -1)
 
-    start = (nodes, jnp.array(True))
-    return jax.lax.while_loop(lambda carry: carry[1], hook, start)[0]
+    def apart(carry: tuple[jax.Array, jax.Array]) -> jax.Array:
+        # Where no edge joins two labels each island has one, the least of its nodes:
+        # that node has it, for labels only fall, and never leave an island.
+        _, (a, b) = carry
+        return jnp.any(alive & (a != b))
+
+    nodes = jnp.arange(num_nodes, dtype=jnp.uint32)
+    start = nodes, ends.reshape(2, -1)
+    return jax.lax.while_loop(apart, hook, start)[0].astype(jnp.int32)
+
+
+def _at(x: jax.Array, index: jax.Array) -> jax.Array:
+    return x.at[index].get(mode="promise_in_bounds")
 
 
 @functools.cache
@@ -297,7 +307,7 @@ def _(
     return value, jnp.where(edge >= 0, tangents[2][jnp.maximum(edge, 0)], 0)
 
 
-def running_count(label: jax.Array) -> jax.Array:
+def count_changes(label: jax.Array) -> jax.Array:
     """Count the changes down each column (n, T) to each row: (n, T) integers.
 
     Piecewise constant: no derivative passes.
@@ -308,18 +318,19 @@ def running_count(label: jax.Array) -> jax.Array:
     def walk(label: jax.Array) -> jax.Array:
         # On a CPU one pass, of whole rows where there are lanes.
         def row(i: jax.Array) -> jax.Array:
-            return jax.lax.dynamic_slice(label, (i, jnp.uint32(0)), (1, width))
+            return jax.lax.dynamic_slice(label, (i, zero), (1, width))
 
         def add(
             i: jax.Array, carry: tuple[jax.Array, jax.Array]
         ) -> tuple[jax.Array, jax.Array]:
             count, counts = carry
+            i = i.astype(jnp.uint32)
             count = count + (row(i) != row(i - 1)).astype(dtype)
-            put = jax.lax.dynamic_update_slice(counts, count, (i, jnp.uint32(0)))
-            return count, put
+            return count, jax.lax.dynamic_update_slice(counts, count, (i, zero))
 
+        zero = jnp.uint32(0)
         start = jnp.zeros((1, width), dtype), jnp.zeros((size, width), dtype)
-        return jax.lax.fori_loop(jnp.uint32(1), jnp.uint32(size), add, start)[1]
+        return jax.lax.fori_loop(1, size, add, start)[1]
 
     def whole(label: jax.Array) -> jax.Array:
         differs = jnp.pad(label[1:] != label[:-1], ((1, 0), (0, 0)))

@@ -22,6 +22,8 @@ from jax import lax
 
 LANES = 256
 """Copies in a tile: many share what a step costs, few wait long for the slowest."""
+CACHE = 2**20
+"""Entries of a tile beyond which it is half as wide, to stay in a core's own cache."""
 LIMIT = 65535
 """Nodes from which labels no longer fit 16 bits."""
 PATIENCE = 16
@@ -436,6 +438,11 @@ def in_tiles(num_nodes: int, sweep: jax.Array, alive: jax.Array) -> jax.Array:
     return tiled(lambda x: islands(way, x), jnp.int32, alive)
 
 
+def tile_width(num_rows: int) -> int:
+    """Return how many copies of so many rows make a tile."""
+    return LANES if num_rows * LANES <= CACHE else LANES // 2
+
+
 def tiled(
     tile: Callable[..., Any],
     dtype: jax.typing.DTypeLike | None,
@@ -451,8 +458,8 @@ def tiled(
     Returns:
       (T, m), one or several.
     """
-    size = copies[0].shape[0]
-    width = min(LANES, -(-size // BLOCK) * BLOCK)
+    size, num_rows = copies[0].shape
+    width = min(tile_width(num_rows), -(-size // BLOCK) * BLOCK)
     tiles = -(-size // width)
 
     def split(x: jax.Array) -> jax.Array:

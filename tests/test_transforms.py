@@ -231,13 +231,13 @@ TABLE = {
     "graph.group_count": lambda a, s, x: graph.group_count(
         jnp.where(s.bond_intact, a.bond_nodes[:, 0], -1), a.span_node.shape[0]
     ),
+    "graph.count_changes": lambda a, s, x: graph.count_changes(s.actor[:, None])[:, 0],
     "graph.group_sum": lambda a, s, x: graph.group_sum(
         x * a.bond_area, a.bond_nodes[:, 0], a.span_node.shape[0]
     ),
     "graph.islands": lambda a, s, x: graph.islands(
         a.bond_nodes, s.bond_intact, a.span_node.shape[0], sweep=a.sweep
     ),
-    "graph.running_count": lambda a, s, x: graph.running_count(s.bond_intact),
     "graph.shortest_ways": lambda a, s, x: graph.shortest_ways(
         a.bond_nodes,
         jnp.where(s.bond_intact, 1 + a.bond_area, jnp.inf),

@@ -165,8 +165,9 @@ def measure(name, place, edges, alive, cpp, repeats):
         "vmap": lambda: jax.block_until_ready(ours(e, a, sweep)),
         "scipy": lambda: scipys(edges, few, num_nodes),
     }
-    if batch >= lanes.LANES:
-        tiles = a.reshape(-1, lanes.LANES, len(edges))
+    width = lanes.tile_width(len(edges))
+    if batch >= width:
+        tiles = a.reshape(-1, width, len(edges))
         kept = jnp.array(tiles.swapaxes(1, 2))
         through = lanes.unpack(sweep, num_nodes, len(edges))
         rollout = jax.jit(lambda w, x: lax.map(lambda y: lanes.islands(w, y), x))
