@@ -320,11 +320,23 @@ def push(buffer: Buffer, event: Any) -> Buffer:
 
 
 def _scalars(asset: Asset, *values: Scalar) -> list[jax.Array]:
-    return [jnp.asarray(value, asset.chunk_centroid.dtype) for value in values]
+    return [_apart(value, asset.chunk_centroid.dtype) for value in values]
+
+
+def _apart(value: Scalar, dtype: Any) -> jax.Array:
+    """Return an array that a batch has at hand before it visits bonds and chunks.
+
+    What is computed or looked up for a body, such as its turn of a scan, would be so
+    again for each of its bonds.
+    """
+    array = jnp.asarray(value, dtype)
+    if isinstance(value, int | float):
+        return array
+    return jax.lax.optimization_barrier(array)
 
 
 def _rows(vector: jax.Array, like: jax.Array) -> jax.Array:
-    return jnp.broadcast_to(jnp.asarray(vector, like.dtype), like.shape)
+    return jnp.broadcast_to(_apart(vector, like.dtype), like.shape)
 
 
 def _distance(points: jax.Array, position: jax.Array) -> jax.Array:

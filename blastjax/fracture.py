@@ -155,7 +155,7 @@ def _apply_to_chunks(
     num_nodes = asset.span_node.shape[0]
     damageable = _damageable(state.chunk_health, state.chunk_unbreakable)
     hit = (damage > 0) & damageable & (state.actor != NONE) & chunks.is_chunk(asset)
-    taken = jnp.where(hit, damage, 0)
+    taken = _once(jnp.where(hit, damage, 0))
     hit = taken > 0
 
     if asset.bond_nodes.shape[0]:
@@ -188,6 +188,11 @@ def _apply_to_chunks(
         taken = taken + share
         excess = excess + offer
     return state.replace(chunk_health=health), taken, excess
+
+
+def _once(damage: jax.Array) -> jax.Array:
+    """Return the same: XLA would repeat the program behind it for each that reads it."""
+    return jax.lax.optimization_barrier(damage)
 
 
 def _lookup(x: jax.Array, index: jax.Array) -> jax.Array:
@@ -232,7 +237,7 @@ def _apply_to_bonds(
     asset: Asset, state: State, damage: jax.Array, marks: bool
 ) -> tuple[State, jax.Array]:
     damageable = _damageable(state.bond_health, state.bond_unbreakable)
-    taken = jnp.where((damage > 0) & damageable, damage, 0)
+    taken = _once(jnp.where((damage > 0) & damageable, damage, 0))
     left = state.bond_health - taken
     broken = (taken > 0) & (left <= 0)
     state = state.replace(
