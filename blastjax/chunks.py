@@ -74,6 +74,20 @@ def node_count(asset: Asset, state: State) -> jax.Array:
     return graph.group_count(owner, state.actor.shape[0])
 
 
+def several(asset: Asset, state: State) -> jax.Array:
+    """Return which actors have several graph nodes, the world included, (A,) bool.
+
+    By label. The others are a single chunk.
+
+    Piecewise constant: no derivative passes.
+    """
+    nodes = asset.span_node.shape[0]
+    owner = state.actor[:nodes]
+    # An actor is named by one of its elements: with another node it has two.
+    other = owner != jnp.arange(nodes, dtype=owner.dtype)
+    return graph.group_any(other, owner, state.actor.shape[0])
+
+
 def alone(asset: Asset, state: State) -> jax.Array:
     """Return which elements are an actor by themselves, (A,) bool.
 
@@ -81,9 +95,8 @@ def alone(asset: Asset, state: State) -> jax.Array:
 
     Piecewise constant: no derivative passes.
     """
-    count = node_count(asset, state)
-    owned = (state.actor != NONE) & is_chunk(asset)
-    return owned & (count[jnp.maximum(state.actor, 0)] <= 1)
+    named = state.actor == jnp.arange(state.actor.shape[0], dtype=jnp.int32)
+    return is_chunk(asset) & named & ~several(asset, state)
 
 
 def held(asset: Asset, state: State) -> jax.Array:
@@ -102,8 +115,8 @@ def can_fracture(asset: Asset, state: State) -> jax.Array:
 
     Piecewise constant: no derivative passes.
     """
-    several = node_count(asset, state) > 1
-    return active(asset, state) & (several | (state.chunk_health > 0))
+    breakable = several(asset, state) | (state.chunk_health > 0)
+    return active(asset, state) & breakable
 
 
 def split_required(asset: Asset, state: State) -> jax.Array:
@@ -115,11 +128,11 @@ def split_required(asset: Asset, state: State) -> jax.Array:
     Piecewise constant: no derivative passes.
     """
     capacity = state.actor.shape[0]
-    several = node_count(asset, state) > 1
     nodes = asset.span_node.shape[0]
     touched = graph.group_any(state.dirty, state.actor[:nodes], capacity)
     gives_way = (state.chunk_health <= 0) & has_children(asset)
-    return active(asset, state) & jnp.where(several, touched, gives_way)
+    comes_apart = jnp.where(several(asset, state), touched, gives_way)
+    return active(asset, state) & comes_apart
 
 
 def has_children(asset: Asset) -> jax.Array:

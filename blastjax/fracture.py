@@ -159,8 +159,7 @@ def _apply_to_chunks(
     hit = taken > 0
 
     if asset.bond_nodes.shape[0]:
-        count = chunks.node_count(asset, state)[jnp.maximum(state.actor, 0)]
-        cut = (hit & (count > 1))[:num_nodes]
+        cut = (hit & ~chunks.alone(asset, state))[:num_nodes]
         loses = _at_either_end(asset.bond_nodes, cut)
         dirty = state.dirty
         if marks:

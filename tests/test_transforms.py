@@ -180,6 +180,7 @@ TABLE = {
     "chunks.is_chunk": lambda a, s, x: chunks.is_chunk(a),
     "chunks.moments": lambda a, s, x: chunks.moments(a, s, 2.0 * x),
     "chunks.node_count": lambda a, s, x: chunks.node_count(a, s),
+    "chunks.several": lambda a, s, x: chunks.several(a, s),
     "chunks.owner": lambda a, s, x: chunks.owner(a, s),
     "chunks.split_required": lambda a, s, x: chunks.split_required(a, s),
     "chunks.visible": lambda a, s, x: chunks.visible(a, s),
