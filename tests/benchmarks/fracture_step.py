@@ -3,10 +3,10 @@
 `python -m tests.benchmarks.fracture_step [--json FILE] [--picture FILE]` prints
 microseconds a body for: reset, radial damage, apply, split, visible chunks and events,
 of distinct damage for every body of a batch, all on one core of one process, laps of
-all in turn, the least of each. The moments of the actors are timed apart, and so is the
-same with `apply` and `split` in place of `step`. Peers in the same run are the islands
-alone in C++ (union-find), and a plain NumPy Blast around SciPy's and NetworkX's
-islands; Blast's own figures were recorded elsewhere.
+all in turn, the least of each. The moments of the actors are timed apart, and so are
+the same with `apply` and `split` in place of `step`, and a step of a rollout in a scan.
+Peers in the same run are the islands alone in C++ (union-find), and a plain NumPy Blast
+around SciPy's and NetworkX's islands; Blast's own figures were recorded elsewhere.
 """
 
 import argparse
@@ -33,6 +33,8 @@ FEW = 8
 SLOW = 4096
 """Nodes beyond which NetworkX is left out."""
 DENSITY = 1000.0
+STEPS = 8
+"""Of a rollout."""
 
 
 def blasts(batch, rng):
@@ -69,6 +71,24 @@ def round_trip(asset, point, radius):
 def moments(asset, state):
     """Return mass, centre and inertia of the actors."""
     return chunks.moments(asset, state, DENSITY)
+
+
+def several_blasts(batch, rng):
+    """Return the blasts of a rollout, of all its bodies."""
+    each = [blasts(batch, rng) for _ in range(STEPS)]
+    point, radius = map(np.stack, zip(*each, strict=True))
+    return point.swapaxes(0, 1), 0.5 * radius.T
+
+
+def rollout(asset, state, point, radius):
+    """Return one body's state after a blast in every step of a scan."""
+
+    def step(state, blast):
+        where, reach = blast
+        dealt = damage.falloff(asset, state, where, 2.0, reach, reach)
+        return fracture.step(asset, state, dealt)[0], None
+
+    return jax.lax.scan(step, state, (point, radius))[0]
 
 
 class Plain:
@@ -135,10 +155,12 @@ def measure(nodes, batch, cpp, repeats):
     alive = np.array(state.bond_intact)
     label = np.zeros((batch, nodes), np.int32)
     plain, few = Plain(asset, whole), list(zip(point, radius, strict=True))[:FEW]
+    starts = jax.vmap(lambda _: whole)(point)
     calls = {
         "union-find": lambda: cpp(edges, alive, label),
         "round trip": ours,
         "moments": batch_of(moments, asset, state)[0],
+        "in a scan": batch_of(rollout, asset, starts, *several_blasts(batch, rng))[0],
         "SciPy": lambda: [plain.step(*x, by_scipy) for x in few],
     }
     if nodes <= SLOW:
@@ -154,8 +176,8 @@ def measure(nodes, batch, cpp, repeats):
         np.testing.assert_array_equal(islands, label[i])
         np.testing.assert_array_equal(seen, visible[i])
     row = {"nodes": nodes, "bonds": len(edges), "batch": batch}
-    slow = ("SciPy", "NetworkX")
-    row |= {k: 1e6 * t / (len(few) if k in slow else batch) for k, t in times.items()}
+    bodies = {"SciPy": len(few), "NetworkX": len(few), "in a scan": batch * STEPS}
+    row |= {k: 1e6 * t / bodies.get(k, batch) for k, t in times.items()}
     row["broken"] = float(1 - alive.mean())
     row["scratch"] = scratch // batch
     return row
@@ -181,7 +203,7 @@ def alone(nodes, cpp, repeats):
 
 
 COLUMNS = ("union-find", "round trip", "moments", "SciPy", "NetworkX")
-STAGES = ("generate", "+ step", "+ apply, split")
+STAGES = ("generate", "+ step", "+ apply, split", "in a scan")
 
 
 def report(row):
