@@ -297,17 +297,18 @@ def test_what_the_world_holds_stays_and_lets_go():
 # Collision.
 
 
+@jax.jit
+def find(scene, moment):
+    model = bodies.weigh(scene, moment.bodies)
+    data = bodies.place(scene, moment.bodies, moment.data)
+    data = bodies.kinematics(scene, model, moment.bodies, data)
+    data, found = contact.collide(scene, moment.bodies, model, data)
+    return data._impl.contact, found
+
+
 def touching(scene, moment):
     """Return the contacts of a world at its start, and what was dropped."""
-
-    def find(moment):
-        model = bodies.weigh(scene, moment.bodies)
-        data = bodies.place(scene, moment.bodies, moment.data)
-        data = bodies.kinematics(scene, model, moment.bodies, data)
-        data, found = contact.collide(scene, moment.bodies, model, data)
-        return data._impl.contact, found
-
-    contacts, found = jax.jit(find)(moment)
+    contacts, found = find(scene, moment)
     active = np.asarray(contacts.dist < contacts.includemargin)
     return contacts, active, found
 
