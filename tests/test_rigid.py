@@ -454,6 +454,7 @@ def solution(problem):
     return solver.solve(problem, guess, 0.0, iterations=50, search_steps=20)
 
 
+@jax.jit
 def dense(problem):
     """Return M, J, D, r, lower, upper and a0 without any structure."""
 
@@ -479,8 +480,8 @@ def dense(problem):
         stiff = jnp.broadcast_to(c.stiffness, wanted.shape)
         ends = jnp.full_like(wanted, -jnp.inf), jnp.zeros_like(wanted)
         parts.append(tuple(x.reshape(-1) for x in (stiff, wanted, *ends)))
-    rest = [np.concatenate(x) for x in zip(*parts, strict=True)]
-    return np.asarray(mass(free)), np.asarray(jacobian), *rest, np.asarray(free)
+    rest = [jnp.concatenate(x) for x in zip(*parts, strict=True)]
+    return mass(free), jacobian, *rest, free
 
 
 @pytest.mark.parametrize("kind", PROBLEMS)
@@ -489,7 +490,8 @@ def test_solver_finds_the_minimum_of_equalities_friction_and_contacts(x64, kind)
     for seed in range(3):
         problem = random_problem(seed, **PROBLEMS[kind])
         a, forces, pull, report = solve(problem)
-        mass, jacobian, stiff, wanted, lower, upper, free = dense(problem)
+        seen = map(np.asarray, dense(problem))
+        mass, jacobian, stiff, wanted, lower, upper, free = seen
         a = np.asarray(rows.vector(a))
         push = np.clip(stiff * (jacobian @ a - wanted), lower, upper)
         own = [] if forces.rows is None else [forces.rows]
