@@ -1,5 +1,6 @@
 """Settings and fixtures of all tests."""
 
+import gc
 import importlib.metadata
 import os
 import pathlib
@@ -14,6 +15,17 @@ CACHE = pathlib.Path(__file__).parent.parent / ".pytest_cache" / "compiled"
 # Compilations are most of the cost of these tests; another run need not repeat them.
 jax.config.update("jax_compilation_cache_dir", os.fspath(CACHE))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+
+
+# A trace makes many objects and keeps them: to look through all of them for garbage,
+# again and again, takes a third of the time of tracing a large program.
+gc.set_threshold(100_000, 20, 100)
+
+
+def pytest_collection_finish():
+    """Look no more through what was imported, which stays to the end."""
+    gc.collect()
+    gc.freeze()
 
 
 def pytest_configure(config):

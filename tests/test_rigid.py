@@ -297,17 +297,18 @@ def test_what_the_world_holds_stays_and_lets_go():
 # Collision.
 
 
+@jax.jit
+def find(scene, moment):
+    model = bodies.weigh(scene, moment.bodies)
+    data = bodies.place(scene, moment.bodies, moment.data)
+    data = bodies.kinematics(scene, model, moment.bodies, data)
+    data, found = contact.collide(scene, moment.bodies, model, data)
+    return data._impl.contact, found
+
+
 def touching(scene, moment):
     """Return the contacts of a world at its start, and what was dropped."""
-
-    def find(moment):
-        model = bodies.weigh(scene, moment.bodies)
-        data = bodies.place(scene, moment.bodies, moment.data)
-        data = bodies.kinematics(scene, model, moment.bodies, data)
-        data, found = contact.collide(scene, moment.bodies, model, data)
-        return data._impl.contact, found
-
-    contacts, found = jax.jit(find)(moment)
+    contacts, found = find(scene, moment)
     active = np.asarray(contacts.dist < contacts.includemargin)
     return contacts, active, found
 
@@ -453,6 +454,7 @@ def solution(problem):
     return solver.solve(problem, guess, 0.0, iterations=50, search_steps=20)
 
 
+@jax.jit
 def dense(problem):
     """Return M, J, D, r, lower, upper and a0 without any structure."""
 
@@ -478,8 +480,8 @@ def dense(problem):
         stiff = jnp.broadcast_to(c.stiffness, wanted.shape)
         ends = jnp.full_like(wanted, -jnp.inf), jnp.zeros_like(wanted)
         parts.append(tuple(x.reshape(-1) for x in (stiff, wanted, *ends)))
-    rest = [np.concatenate(x) for x in zip(*parts, strict=True)]
-    return np.asarray(mass(free)), np.asarray(jacobian), *rest, np.asarray(free)
+    rest = [jnp.concatenate(x) for x in zip(*parts, strict=True)]
+    return mass(free), jacobian, *rest, free
 
 
 @pytest.mark.parametrize("kind", PROBLEMS)
@@ -488,7 +490,8 @@ def test_solver_finds_the_minimum_of_equalities_friction_and_contacts(x64, kind)
     for seed in range(3):
         problem = random_problem(seed, **PROBLEMS[kind])
         a, forces, pull, report = solve(problem)
-        mass, jacobian, stiff, wanted, lower, upper, free = dense(problem)
+        seen = map(np.asarray, dense(problem))
+        mass, jacobian, stiff, wanted, lower, upper, free = seen
         a = np.asarray(rows.vector(a))
         push = np.clip(stiff * (jacobian @ a - wanted), lower, upper)
         own = [] if forces.rows is None else [forces.rows]

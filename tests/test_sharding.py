@@ -51,7 +51,9 @@ np.save(sys.argv[2], np.concatenate([qpos, actor], axis=1))
 
 def run(code, devices, path):
     environment = dict(os.environ)
-    environment["XLA_FLAGS"] = f"--xla_force_host_platform_device_count={devices}"
+    # Beside what the tests' settings say about compiling.
+    count = f"--xla_force_host_platform_device_count={devices}"
+    environment["XLA_FLAGS"] = f"{environment.get('XLA_FLAGS', '')} {count}"
     # XLA runs devices in a pool of one thread a core, and they wait in it for tasks
     # of the same pool: as many devices as threads can wait for ever.
     environment["NPROC"] = "8"

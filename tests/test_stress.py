@@ -1,5 +1,7 @@
 """Bond forces: statics by hand, a direct solve, and their derivatives."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -27,6 +29,15 @@ def dtype(request):
         yield np.dtype(request.param)
 
 
+SINGLE = pytest.mark.parametrize(
+    "dtype",
+    ["float32", pytest.param("float64", marks=pytest.mark.slow)],
+    indirect=True,
+)
+"""In float64 only with `-m slow`: a chain and all direct solves are in float64 too, and
+these programs are dear to compile."""
+
+
 @pytest.fixture
 def x64():
     with jax.enable_x64(True):
@@ -38,8 +49,8 @@ def solved(asset, load=DOWN, state=None, **options):
     frame = stress.structure(asset, **options)
     state = fracture.init(asset) if state is None else state
     weight = stress.gravity(frame.mass, jnp.asarray(load, asset.bond_area.dtype))
-    run = jax.jit(lambda f, a, s, w: stress.solve(f, a, s, w, iterations=400))
-    return frame, run(frame, asset, state, weight)
+    run = jax.jit(stress.solve, static_argnames="iterations")
+    return frame, run(frame, asset, state, weight, iterations=400)
 
 
 def by_place(asset, axis):
@@ -71,6 +82,7 @@ def test_hanging_chain(dtype, method):
     close(np.asarray(judged.normal)[order], 1000 * G * np.arange(1, 13.0), dtype)
 
 
+@SINGLE
 def test_cantilever(dtype):
     asset = shapes.beam(9, (1.0, 0.5, 0.5), anchor=("x-",), dtype=dtype)
     _, found = solved(asset)
@@ -83,6 +95,7 @@ def test_cantilever(dtype):
     close(sign * -torque[:, 1], line * free**2 / 2, dtype)
 
 
+@SINGLE
 def test_simply_supported_beam(dtype):
     asset = shapes.grid((8, 1, 1), (1.0, 0.5, 0.5), anchor=("x-", "x+"), dtype=dtype)
     ends = np.asarray(asset.bond_nodes)[:, 1] == 0
@@ -96,6 +109,7 @@ def test_simply_supported_beam(dtype):
     close(moment, line * x * (8 - x) / 2, dtype)
 
 
+@SINGLE
 def test_three_hinged_arch(dtype):
     # Blocks on a half circle; hinges at both feet and the crown.
     count, radius = 12, 5.0
@@ -128,6 +142,7 @@ def test_three_hinged_arch(dtype):
     close(np.abs(crown), np.array([thrust, 0, 0]), dtype)
 
 
+@SINGLE
 def test_symmetric_tower(dtype):
     asset = shapes.tower(4, 3, (1.0, 1.0, 1.0), dtype=dtype)
     _, found = solved(asset)
@@ -265,7 +280,6 @@ def test_derivatives_are_central_differences(x64, name, method):
         "bond": asset.bond_centroid,
     }
 
-    @jax.jit
     def loss(p):
         built = plan.replace(
             stiffness=jnp.exp(p["stiffness"]),
@@ -280,7 +294,9 @@ def test_derivatives_are_central_differences(x64, name, method):
         both = jnp.concatenate([found.force, found.torque], axis=1)
         return jnp.sum(weight * both)
 
-    slope = jax.jit(jax.grad(loss))(parts)
+    # One program for both: what compiling costs is more than what running costs.
+    both = jax.jit(jax.value_and_grad(loss))
+    slope = both(parts)[1]
     for name in names:
         way = jnp.asarray(rng.normal(size=parts[name].shape))
         step = 1e-2 * float(jnp.abs(parts[name]).max()) / 3
@@ -288,7 +304,7 @@ def test_derivatives_are_central_differences(x64, name, method):
             step = 1e-3
 
         def along(t, name=name, way=way):
-            return float(loss({**parts, name: parts[name] + t * way}))
+            return float(both({**parts, name: parts[name] + t * way})[0])
 
         # Fourth order: what is left is the rounding of the loss.
         near, far = along(step) - along(-step), along(2 * step) - along(-2 * step)
@@ -330,6 +346,22 @@ def test_derivatives_in_float32_are_those_in_float64(method):
 EXTREMES = ("no load", "isolated nodes", "all broken", "soft")
 
 
+@jax.jit
+@functools.partial(jax.grad, argnums=(0, 1, 2), has_aux=True, allow_int=True)
+def slope_of_worth(frame, asset, load, state):
+    """Return the slope of what bonds are used, and the solution."""
+    found = stress.solve(frame, asset, state, load)
+    judged = stress.bond_stress(
+        found.force,
+        found.torque,
+        asset.bond_normal,
+        asset.bond_area,
+        jnp.ones_like(asset.bond_area),
+    )
+    worth = stress.utilisation(stress.Limits(1e6, 2e6), judged)
+    return jnp.sum(worth) + jnp.sum(found.force), found
+
+
 @pytest.mark.parametrize(
     "extreme, method",
     [
@@ -358,22 +390,7 @@ def test_extremes_stay_finite(method, extreme):
         bending = jnp.where(stiffness > 0, bending, 0.0)
     plan = stress.structure(asset, stiffness=stiffness, bending=bending, method=method)
 
-    def total(frame, asset, load):
-        found = stress.solve(frame, asset, state, load)
-        judged = stress.bond_stress(
-            found.force,
-            found.torque,
-            asset.bond_normal,
-            asset.bond_area,
-            jnp.ones_like(asset.bond_area),
-        )
-        limits = stress.Limits(1e6, 2e6)
-        worth = stress.utilisation(limits, judged)
-        return jnp.sum(worth) + jnp.sum(found.force), found
-
-    slope, found = jax.jit(jax.grad(total, (0, 1, 2), has_aux=True, allow_int=True))(
-        plan, asset, load
-    )
+    slope, found = slope_of_worth(plan, asset, load, state)
     assert found.converged
     for leaf in jax.tree.leaves((slope, found)):
         if leaf.dtype != jax.dtypes.float0:
