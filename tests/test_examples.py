@@ -35,6 +35,7 @@ def test_gymnasium_loop(capsys):
     assert "episodes ended" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_which_brick(capsys, tmp_path):
     load("which_brick").main(tmp_path / "table.png")
     lines = capsys.readouterr().out.splitlines()
@@ -43,6 +44,7 @@ def test_which_brick(capsys, tmp_path):
     assert (tmp_path / "table.png").stat().st_size > 5000
 
 
+@pytest.mark.slow
 def test_break_a_vase(capsys, tmp_path):
     actors = load("break_a_vase").main(tmp_path)
     assert actors > 3
@@ -57,6 +59,7 @@ def test_aim_a_shot(capsys, tmp_path):
     assert (tmp_path / "aim.png").stat().st_size > 5000
 
 
+@pytest.mark.slow
 def test_how_strong(capsys, tmp_path):
     picture = tmp_path / "strength.png"
     seen, new, guess = load("how_strong").main(picture, count=8, steps=200)

@@ -1,25 +1,31 @@
 """The library against the plain-Python reference on random assets and damage."""
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests import conformance, random_cases
 
 pytestmark = pytest.mark.usefixtures("strict")
 
-EXAMPLES = 500
-"""For padded and unpadded each: 1,000 in all."""
+EXAMPLES = 120, 500
+"""For padded and unpadded each: as a rule, and of a slow test: 1,000 in all."""
 
 
-@pytest.mark.parametrize("padded", [True, False], ids=["padded", "unpadded"])
-@settings(
-    max_examples=EXAMPLES,
-    deadline=None,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
+@pytest.mark.parametrize(
+    "examples", [EXAMPLES[0], pytest.param(EXAMPLES[1], marks=pytest.mark.slow)]
 )
-@given(seed=st.integers(0, 2**32 - 1), size=st.sampled_from(random_cases.SIZES))
-def test_agrees_with_reference(padded, seed, size):
+@pytest.mark.parametrize("padded", [True, False], ids=["padded", "unpadded"])
+def test_agrees_with_reference(padded, examples):
+    @settings(max_examples=examples, deadline=None)
+    @given(seed=st.integers(0, 2**32 - 1), size=st.sampled_from(random_cases.SIZES))
+    def agrees(seed, size):
+        check(padded, seed, size)
+
+    agrees()
+
+
+def check(padded, seed, size):
     case = random_cases.random_case(seed, size)
     replay = conformance.Replay(case, padded=padded).run()
     assert not replay.found

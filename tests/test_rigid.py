@@ -538,7 +538,9 @@ def test_solver_has_forward_and_reverse_derivatives(x64, kind):
     assert abs((above - below) / (2 * h) / forward - 1) < 1e-7
 
 
-@pytest.mark.parametrize("integrator", ["Euler", "implicitfast"])
+@pytest.mark.parametrize(
+    "integrator", ["Euler", pytest.param("implicitfast", marks=pytest.mark.slow)]
+)
 def test_a_body_whose_inertia_lies_askew_tumbles_as_euler_says(x64, integrator):
     """Also beside a joint of the user's that is damped implicitly."""
     model = f"""

@@ -299,6 +299,7 @@ def close(a, b, tolerance=1e-5):
         np.testing.assert_allclose(x, y, rtol=tolerance, atol=tolerance * scale)
 
 
+@pytest.mark.slow
 def test_scan_of_a_batch_is_a_loop_of_loops(tiny):
     scene, _, step = tiny
     apart = [roll(step, w, 5)[0] for w in lanes(scene)]
@@ -320,6 +321,7 @@ def test_jit_is_eager(tiny):
     close(step(start), world.step(scene, start, impact=impact))
 
 
+@pytest.mark.slow
 def test_derivative_of_a_rollout_is_its_difference_quotient():
     with jax.enable_x64(True):
         asset = shapes.grid((2, 1, 1), EDGE, dtype=np.float64)

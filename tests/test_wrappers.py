@@ -128,6 +128,7 @@ def test_time_limit_of_the_batch():
     assert cut == [False, False, True, False, False, False, True]
 
 
+@pytest.mark.slow
 def test_thousand_random_steps_stay_finite():
     envs_ = batch()
     envs_.action_space.seed(0)
