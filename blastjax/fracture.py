@@ -190,7 +190,7 @@ def _apply_to_chunks(
 
 
 def _once(damage: jax.Array) -> jax.Array:
-    """Return the same: XLA would repeat the program behind it for each that reads it."""
+    """Return the same; XLA would repeat the program behind it wherever it is read."""
     return jax.lax.optimization_barrier(damage)
 
 
