@@ -77,7 +77,8 @@ def node_count(asset: Asset, state: State) -> jax.Array:
 def several(asset: Asset, state: State) -> jax.Array:
     """Return which actors have several graph nodes, the world included, (A,) bool.
 
-    By label. The others are a single chunk.
+    By label; it relies on each actor being named by one of its elements. An actor that
+    has not several is a single chunk, or the world.
 
     Piecewise constant: no derivative passes.
     """

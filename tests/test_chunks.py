@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from blastjax import author, chunks, damage, fracture
-from blastjax.core import NONE
+from blastjax.core import NONE, Damage
 
 pytestmark = pytest.mark.usefixtures("strict")
 
@@ -184,3 +184,27 @@ def test_moments_of_batches_of_batches():
         np.testing.assert_allclose(getattr(by_scan, name)[0], flat, 1e-5, 1e-5)
         heavy = flat if name == "center" else 3 * flat
         np.testing.assert_allclose(getattr(scaled, name)[1], heavy, 1e-5, 1e-5)
+
+
+def test_owners_of_a_batch_are_those_one_by_one():
+    asset = wall()
+    rng = np.random.default_rng(4)
+    whole = fracture.init(asset)
+    bond = rng.random((9, asset.bond_nodes.shape[0])) * 1.5
+    chunk = 1.5 * (rng.random((9, whole.actor.size)) < 0.05)
+    hurt = Damage(jnp.asarray(bond, jnp.float32), jnp.asarray(chunk, jnp.float32))
+
+    def seen(asset, damage):
+        state = fracture.step(asset, whole, damage)[0]
+        count = chunks.node_count(asset, state) > 1
+        queries = chunks.owner, chunks.visible, chunks.several, chunks.alone
+        return *(query(asset, state) for query in queries), count
+
+    together = jax.jit(jax.vmap(seen, (None, 0)))(asset, hurt)
+    one = jax.jit(seen)
+    apart = [one(asset, jax.tree.map(lambda x, i=i: x[i], hurt)) for i in range(9)]
+    for many, *each in zip(together, *apart, strict=True):
+        np.testing.assert_array_equal(many, np.stack(each))
+    owner, visible, several, alone, count = map(np.asarray, together)
+    np.testing.assert_array_equal(several, count)
+    assert visible.any() and alone.any() and several.any() and (owner == NONE).any()

@@ -213,3 +213,13 @@ def test_a_condition_anywhere_in_a_batch_stays_a_condition():
     flag = jax.vmap(jax.vmap(graph.anywhere))(x > 0)
     np.testing.assert_array_equal(flag, np.ones((2, 3), bool))
     assert not jax.vmap(graph.anywhere)(x[1] > 0).any()
+
+
+def test_tiles_of_large_graphs_are_half_as_wide(monkeypatch):
+    monkeypatch.setattr(lanes, "CACHE", 2**10)
+    assert lanes.tile_width(5) == lanes.LANES // 2
+    rng = np.random.default_rng(7)
+    edges = random_graph("random", 40, rng)
+    alive = rng.random((200, len(edges))) < 0.5
+    found = jax.jit(jax.vmap(lambda x: graph.islands(jnp.asarray(edges), x, 40)))(alive)
+    np.testing.assert_array_equal(found, scipys(edges, alive, 40))
