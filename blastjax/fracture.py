@@ -58,7 +58,7 @@ def init(
     dtype = asset.chunk_centroid.dtype
     num_nodes, capacity = asset.span_node.shape[0], asset.element_chunk.shape[0]
     num_bonds = asset.bond_nodes.shape[0]
-    # Behind barriers, or every body of a batch finds out anew.
+    # Behind a barrier, or every body of a batch finds out anew.
     real_bond = jax.lax.optimization_barrier(
         asset.bond_nodes[:, 0] != asset.bond_nodes[:, 1]
     )

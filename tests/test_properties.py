@@ -20,15 +20,11 @@ def test_agrees_with_reference(padded, examples):
     @settings(max_examples=examples, deadline=None)
     @given(seed=st.integers(0, 2**32 - 1), size=st.sampled_from(random_cases.SIZES))
     def agrees(seed, size):
-        check(padded, seed, size)
+        case = random_cases.random_case(seed, size)
+        replay = conformance.Replay(case, padded=padded).run()
+        assert not replay.found
 
     agrees()
-
-
-def check(padded, seed, size):
-    case = random_cases.random_case(seed, size)
-    replay = conformance.Replay(case, padded=padded).run()
-    assert not replay.found
 
 
 def test_cases_cover_what_they_should():

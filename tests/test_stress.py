@@ -29,7 +29,7 @@ def dtype(request):
         yield np.dtype(request.param)
 
 
-SINGLE = pytest.mark.parametrize(
+FLOAT64_IF_SLOW = pytest.mark.parametrize(
     "dtype",
     ["float32", pytest.param("float64", marks=pytest.mark.slow)],
     indirect=True,
@@ -53,6 +53,17 @@ def solved(asset, load=DOWN, state=None, **options):
     return frame, run(frame, asset, state, weight, iterations=400)
 
 
+def stresses(asset, found):
+    """Return the stresses of bonds between nodes one metre apart."""
+    return stress.bond_stress(
+        found.force,
+        found.torque,
+        asset.bond_normal,
+        asset.bond_area,
+        jnp.ones_like(asset.bond_area),
+    )
+
+
 def by_place(asset, axis):
     """Return bonds in order along an axis."""
     return np.argsort(np.asarray(asset.bond_centroid)[:, axis])
@@ -72,17 +83,11 @@ def test_hanging_chain(dtype, method):
     # The force on the first, lower node points up; at the top the world is the second.
     weight = 0.25 * 1000 * G
     close(np.asarray(found.force)[order, 2], weight * np.arange(1, 13), dtype)
-    judged = stress.bond_stress(
-        found.force,
-        found.torque,
-        asset.bond_normal,
-        asset.bond_area,
-        jnp.ones_like(asset.bond_area),
-    )
+    judged = stresses(asset, found)
     close(np.asarray(judged.normal)[order], 1000 * G * np.arange(1, 13.0), dtype)
 
 
-@SINGLE
+@FLOAT64_IF_SLOW
 def test_cantilever(dtype):
     asset = shapes.beam(9, (1.0, 0.5, 0.5), anchor=("x-",), dtype=dtype)
     _, found = solved(asset)
@@ -95,7 +100,7 @@ def test_cantilever(dtype):
     close(sign * -torque[:, 1], line * free**2 / 2, dtype)
 
 
-@SINGLE
+@FLOAT64_IF_SLOW
 def test_simply_supported_beam(dtype):
     asset = shapes.grid((8, 1, 1), (1.0, 0.5, 0.5), anchor=("x-", "x+"), dtype=dtype)
     ends = np.asarray(asset.bond_nodes)[:, 1] == 0
@@ -109,7 +114,7 @@ def test_simply_supported_beam(dtype):
     close(moment, line * x * (8 - x) / 2, dtype)
 
 
-@SINGLE
+@FLOAT64_IF_SLOW
 def test_three_hinged_arch(dtype):
     # Blocks on a half circle; hinges at both feet and the crown.
     count, radius = 12, 5.0
@@ -142,7 +147,7 @@ def test_three_hinged_arch(dtype):
     close(np.abs(crown), np.array([thrust, 0, 0]), dtype)
 
 
-@SINGLE
+@FLOAT64_IF_SLOW
 def test_symmetric_tower(dtype):
     asset = shapes.tower(4, 3, (1.0, 1.0, 1.0), dtype=dtype)
     _, found = solved(asset)
@@ -295,8 +300,8 @@ def test_derivatives_are_central_differences(x64, name, method):
         return jnp.sum(weight * both)
 
     # One program for both: what compiling costs is more than what running costs.
-    both = jax.jit(jax.value_and_grad(loss))
-    slope = both(parts)[1]
+    valued = jax.jit(jax.value_and_grad(loss))
+    slope = valued(parts)[1]
     for name in names:
         way = jnp.asarray(rng.normal(size=parts[name].shape))
         step = 1e-2 * float(jnp.abs(parts[name]).max()) / 3
@@ -304,7 +309,7 @@ def test_derivatives_are_central_differences(x64, name, method):
             step = 1e-3
 
         def along(t, name=name, way=way):
-            return float(both({**parts, name: parts[name] + t * way})[0])
+            return float(valued({**parts, name: parts[name] + t * way})[0])
 
         # Fourth order: what is left is the rounding of the loss.
         near, far = along(step) - along(-step), along(2 * step) - along(-2 * step)
@@ -351,13 +356,7 @@ EXTREMES = ("no load", "isolated nodes", "all broken", "soft")
 def slope_of_worth(frame, asset, load, state):
     """Return the slope of what bonds are used, and the solution."""
     found = stress.solve(frame, asset, state, load)
-    judged = stress.bond_stress(
-        found.force,
-        found.torque,
-        asset.bond_normal,
-        asset.bond_area,
-        jnp.ones_like(asset.bond_area),
-    )
+    judged = stresses(asset, found)
     worth = stress.utilisation(stress.Limits(1e6, 2e6), judged)
     return jnp.sum(worth) + jnp.sum(found.force), found
 

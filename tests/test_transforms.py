@@ -180,8 +180,8 @@ TABLE = {
     "chunks.is_chunk": lambda a, s, x: chunks.is_chunk(a),
     "chunks.moments": lambda a, s, x: chunks.moments(a, s, 2.0 * x),
     "chunks.node_count": lambda a, s, x: chunks.node_count(a, s),
-    "chunks.several": lambda a, s, x: chunks.several(a, s),
     "chunks.owner": lambda a, s, x: chunks.owner(a, s),
+    "chunks.several": lambda a, s, x: chunks.several(a, s),
     "chunks.split_required": lambda a, s, x: chunks.split_required(a, s),
     "chunks.visible": lambda a, s, x: chunks.visible(a, s),
     "damage.buffer": lambda a, s, x: damage.buffer({"at": AT * x}, 3),
@@ -226,13 +226,13 @@ TABLE = {
         a.span_node.shape[0],
         sweep=a.sweep,
     )[0],
+    "graph.count_changes": lambda a, s, x: graph.count_changes(s.actor[:, None])[:, 0],
     "graph.group_any": lambda a, s, x: graph.group_any(
         s.bond_intact, a.bond_nodes[:, 0], a.span_node.shape[0]
     ),
     "graph.group_count": lambda a, s, x: graph.group_count(
         jnp.where(s.bond_intact, a.bond_nodes[:, 0], -1), a.span_node.shape[0]
     ),
-    "graph.count_changes": lambda a, s, x: graph.count_changes(s.actor[:, None])[:, 0],
     "graph.group_sum": lambda a, s, x: graph.group_sum(
         x * a.bond_area, a.bond_nodes[:, 0], a.span_node.shape[0]
     ),
