@@ -241,19 +241,18 @@ def islands(way: Order, alive: jax.Array) -> jax.Array:
     names = jnp.pad(way.visit, (0, GROUP)).astype(dtype)
     labels = jnp.broadcast_to(names[:, None], (num_nodes + GROUP, num_copies))
 
-    bits = _bits(way, alive)
+    cut = _cut(way, alive)
 
     def offer(
         labels: jax.Array, at: Where, near: jax.Array, by: jax.Array
     ) -> jax.Array:
         side, first, which = at
-        if isinstance(which, int):
-            start = side, first, jnp.uint32(0)
-            here = lax.dynamic_slice(bits, start, (1, GROUP, num_copies))[0]
-            kept = (here & jnp.array(1 << which, bits.dtype)) != 0
-        else:
-            kept = take_rows(alive, by)
-        return jnp.where(kept, take_rows(labels, near), none)
+        there = take_rows(labels, near)
+        if not isinstance(which, int):
+            return jnp.where(take_rows(alive, by), there, none)
+        start = side, first, jnp.uint32(0)
+        here = lax.dynamic_slice(cut, start, (1, GROUP, num_copies))[0]
+        return there | _spread(here, which).astype(dtype)
 
     def ease(labels: jax.Array, count: jax.Array) -> jax.Array:
         jumps = (count >= 2 * PATIENCE) & (count % 8 == 0)
@@ -262,8 +261,8 @@ def islands(way: Order, alive: jax.Array) -> jax.Array:
     return take_rows(_settle(labels, way, offer, ease), way.turn)
 
 
-def _bits(way: Order, alive: jax.Array) -> jax.Array:
-    """Pack which of each row's first neighbours are joined to it.
+def _cut(way: Order, alive: jax.Array) -> jax.Array:
+    """Pack which of each row's first neighbours are not joined to it.
 
     A sweep then reads one row for all of them.
 
@@ -276,16 +275,30 @@ def _bits(way: Order, alive: jax.Array) -> jax.Array:
     """
     width = way.near.shape[2]
     dtype = jnp.uint8 if width <= 8 else jnp.uint16
+    by = way.by.reshape(-1, width)
 
-    def pack(by: jax.Array) -> jax.Array:
+    def pack(most: int) -> jax.Array:
         packed = jnp.zeros((by.shape[0], alive.shape[1]), dtype)
-        for j in range(width):
+        for j in range(most):
             bit = jnp.array(1 << j, dtype)
-            packed |= jnp.where(take_rows(alive, by[:, j]), bit, 0).astype(dtype)
-        return packed
+            packed |= jnp.where(take_rows(alive, by[:, j]), 0, bit).astype(dtype)
+        return packed.reshape(*way.by.shape[:2], -1)
 
-    both = pack(way.by.reshape(-1, width)).reshape(*way.by.shape[:2], -1)
-    return lax.optimization_barrier(both)
+    # Edges are read all over the place, so many times as there may be neighbours. In a
+    # lattice none has more than on average away from its faces, half of K.
+    half = -(-width // 2)
+    few = jnp.max(way.degree) <= half
+    packed = lax.cond(few, lambda: pack(half), lambda: pack(width))
+    return lax.optimization_barrier(packed)
+
+
+def _spread(bits: jax.Array, which: int) -> jax.Array:
+    """Return all bits set where that one is set, none where it is not, 16 bits each."""
+    # Shifts: a comparison would be made in the width of the bits, and then widened.
+    first = bits.astype(jnp.uint16) << jnp.uint16(15 - which)
+    signed = lax.bitcast_convert_type(first, jnp.int16)
+    spread = lax.shift_right_arithmetic(signed, jnp.int16(15))
+    return lax.bitcast_convert_type(spread, jnp.uint16)
 
 
 def _sweep(
@@ -406,11 +419,17 @@ def _total(rows: jax.Array) -> jax.Array:
     # So many labels add up to 16 bits. The last few may count twice.
     some = min(32, LIMIT // num_nodes, num_nodes)
 
+    def row(i: jax.Array) -> jax.Array:
+        return lax.dynamic_slice(rows, (i, jnp.uint32(0)), (1, rows.shape[1]))[0]
+
     def add(i: jax.Array, total: jax.Array) -> jax.Array:
-        start = i * some, jnp.uint32(0)
-        part = lax.dynamic_slice(rows, start, (some, rows.shape[1]))
-        parts = (part[j].astype(jnp.uint16) for j in range(some))
-        return total + functools.reduce(jnp.add, parts).astype(jnp.uint32)
+        # Row by row, a slice of several would be copied; and behind a barrier, fused
+        # with the wider sum vectors would be half as long.
+        start = jnp.minimum(i * some, jnp.uint32(num_nodes + GROUP - some))
+        labels = [row(start + jnp.uint32(j)).astype(jnp.uint16) for j in range(some)]
+        few = [labels[j : j + 8] for j in range(0, some, 8)]
+        sums = lax.optimization_barrier([functools.reduce(jnp.add, x) for x in few])
+        return total + functools.reduce(jnp.add, sums).astype(jnp.uint32)
 
     count = jnp.uint32(-(-num_nodes // some))
     start = jnp.zeros(rows.shape[1], jnp.uint32)
