@@ -19,6 +19,7 @@ from blastjax import (
     soft,
     spatial,
     stress,
+    tiles,
 )
 from blastjax.core import Asset, Damage, State
 
@@ -45,6 +46,7 @@ __all__ = [
     "soft",
     "spatial",
     "stress",
+    "tiles",
     "world",
     "wrappers",
 ]

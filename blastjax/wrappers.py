@@ -18,7 +18,7 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from blastjax import envs
+from blastjax import envs, graph, tiles
 
 _SEEDS = 2**31 - 1
 
@@ -29,8 +29,8 @@ class _Programs:
     def __init__(self, env: Env) -> None:
         self.reset = jax.jit(env.reset)
         self.step = jax.jit(env.step)
-        self.reset_all = jax.jit(jax.vmap(lambda key: env.reset(key)))
-        self.step_all = jax.jit(jax.vmap(env.step))
+        self.reset_all = jax.jit(tiles.vmap(env.reset))
+        self.step_all = jax.jit(tiles.vmap(env.step))
         self.refresh = jax.jit(functools.partial(_refresh, env))
 
 
@@ -41,12 +41,19 @@ def _programs(env: Env) -> _Programs:
 
 def _refresh(env: Env, state: State, keys: jax.Array, mask: jax.Array) -> State:
     """Start the masked environments of a batch anew."""
-    fresh = jax.vmap(env.reset)(keys)
 
-    def choose(new: jax.Array, old: jax.Array) -> jax.Array:
-        return jnp.where(mask.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+    def one(state: State, key: jax.Array, starts: jax.Array) -> State:
+        def choose(new: jax.Array, old: jax.Array) -> jax.Array:
+            return jnp.where(starts, new, old)
 
-    return jax.tree.map(choose, fresh, state)
+        # A tile where none starts is left as it is.
+        return jax.lax.cond(
+            graph.anywhere(starts),
+            lambda: jax.tree.map(choose, env.reset(key), state),
+            lambda: state,
+        )
+
+    return tiles.vmap(one)(state, keys, mask)
 
 
 class GymEnv(gymnasium.Env):

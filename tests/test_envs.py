@@ -1,5 +1,7 @@
 """Breach: rules, rewards, Brax's wrappers, and what auto-reset must rebuild."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -103,8 +105,20 @@ def test_target_is_random_by_key_or_given(env):
     )
 
 
-def test_auto_reset_rebuilds_everything_under_scan(env):
-    wrapped = training.wrap(env, episode_length=5, action_repeat=1)
+@pytest.mark.parametrize(
+    "wrapper",
+    [
+        training.VmapWrapper,
+        pytest.param(
+            functools.partial(envs.VmapWrapper, width=2), marks=pytest.mark.slow
+        ),
+    ],
+    ids=["Brax's", "in tiles"],
+)
+def test_auto_reset_rebuilds_everything_under_scan(env, wrapper):
+    # As Brax's training wraps it.
+    wrapped = training.EpisodeWrapper(wrapper(env), 5, action_repeat=1)
+    wrapped = training.AutoResetWrapper(wrapped)
     first = jax.jit(wrapped.reset)(jax.random.split(jax.random.PRNGKey(1), BATCH))
     leaves = jax.tree.leaves(first.pipeline_state)
     assert all(leaf.shape[:1] == (BATCH,) for leaf in leaves)

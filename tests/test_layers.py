@@ -18,6 +18,7 @@ FLOOR = {
     "core": 1,
     "spatial": 1,
     "lanes": 0,
+    "tiles": 0,
     "bottlenecks": 1,
     "graph": 2,
     "author": 3,

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from blastjax import tiles
 from blastjax.commands.options import number, progress, quiet, whole
 
 HELP = (
@@ -155,8 +156,8 @@ def _programs(
 
     # One device, though a CPU could be split into one for each core: two devices of one
     # process can block each other for good in XLA's thread pool.
-    state = jax.block_until_ready(jax.jit(jax.vmap(env.reset))(keys))
-    step = jax.jit(jax.vmap(env.step)).lower(state, actions).compile()
+    state = jax.block_until_ready(jax.jit(tiles.vmap(env.reset))(keys))
+    step = jax.jit(tiles.vmap(env.step)).lower(state, actions).compile()
 
     @jax.jit
     def look(state: Any, index: int) -> render.Pose:

@@ -1,9 +1,10 @@
 """A step of a breaking world against its peers: python -m tests.benchmarks.world_step.
 
 The same block of cubes lands on a plane: as this library's breakable, with and without
-damage by impact; as MJX bodies welded at every bond; as a single MJX body that cannot
-break; and both of these in MuJoCo C. float32 (C: float64), one process, the same time
-step and iteration limits, laps of all of them in turn, the best of each counts.
+damage by impact, and a batch of more than one tile by `tiles.vmap` too; as MJX bodies
+welded at every bond; as a single MJX body that cannot break; and both of these in
+MuJoCo C. float32 (C: float64), one process, the same time step and iteration limits,
+laps of all of them in turn, the best of each counts.
 """
 
 import argparse
@@ -17,7 +18,7 @@ import mujoco
 import numpy as np
 from mujoco import mjx
 
-from blastjax import world
+from blastjax import tiles, world
 from blastjax.author import shapes
 from blastjax.rigid import build
 
@@ -76,9 +77,9 @@ def batched(data, count):
 class Batch:
     """A compiled step of many worlds that have come to rest."""
 
-    def __init__(self, step, start, options):
+    def __init__(self, step, start, options, vmap=jax.vmap):
         began = time.perf_counter()
-        self.step = jax.jit(jax.vmap(step)).lower(start).compile()
+        self.step = jax.jit(vmap(step)).lower(start).compile()
         self.compiling = time.perf_counter() - began
         self.now = start
         for _ in range(options.settle):
@@ -142,6 +143,8 @@ def competitors(options) -> dict[str, Any]:
         return world.step(scene, w)[0]
 
     found: dict[str, Any] = {"ours, breaking": Batch(breaking, worlds, options)}
+    if options.batch > tiles.WIDTH:
+        found["ours, in tiles"] = Batch(breaking, worlds, options, tiles.vmap)
     if options.alone:
         return found
     found["ours, rigid only"] = Batch(rigid, worlds, options)
