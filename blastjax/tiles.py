@@ -62,7 +62,7 @@ def vmap(function: Callable[..., Out], width: int | None = None) -> Callable[...
 
 
 def _batch_size(args: Any) -> int:
-    sizes = {}
+    sizes: dict[int, str] = {}
     for path, leaf in jax.tree_util.tree_leaves_with_path(args):
         if not jnp.shape(leaf):
             where = jax.tree_util.keystr(path)
