@@ -32,7 +32,7 @@ MOST = 16
 """Neighbours on one side that are read in one step; nodes with more are hubs."""
 DEGREES = (0, 1, 2, 3, 4, 6, 8, 12, MOST)
 """Nodes' neighbours on one side are read in one step of the next such size."""
-GROUP = 4
+GROUP = 6
 """Nodes that a sweep visits at a time: a step of a loop costs as much as some rows."""
 BLOCK = 8
 """Copies that are turned into lanes at a time; they divide those in a tile."""

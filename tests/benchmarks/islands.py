@@ -21,7 +21,7 @@ from scipy.sparse import csgraph
 from scipy.spatial import Delaunay
 
 from blastjax import graph, lanes
-from tests.benchmarks.timing import least, one_core
+from tests.benchmarks.timing import keep_memory, least, one_core
 
 UNION_FIND = r"""
 #include <cstdint>
@@ -230,6 +230,7 @@ def picture(rows, path):
 
 def main():
     one_core()
+    keep_memory()
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--json", type=pathlib.Path)
     parser.add_argument("--picture", type=pathlib.Path)
