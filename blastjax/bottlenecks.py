@@ -133,10 +133,12 @@ def _of_degree(degree: int) -> Lowest:
         side: jax.Array,
         row: jax.Array,
     ) -> jax.Array:
-        low = _row(level, row)
+        low = lanes.row(level, row)
         for j in range(degree):
             near, by = way.near[side, row, j], way.by[side, row, j]
-            low = jnp.minimum(low, jnp.maximum(_row(level, near), _row(cost, by)))
+            low = jnp.minimum(
+                low, jnp.maximum(lanes.row(level, near), lanes.row(cost, by))
+            )
         return low
 
     return lowest
@@ -150,9 +152,11 @@ def _of_hub(
     row: jax.Array,
 ) -> jax.Array:
     def lower(low: jax.Array, near: jax.Array, by: jax.Array) -> jax.Array:
-        return jnp.minimum(low, jnp.maximum(_row(level, near), _row(cost, by)))
+        return jnp.minimum(
+            low, jnp.maximum(lanes.row(level, near), lanes.row(cost, by))
+        )
 
-    return _over_neighbours(way, side, row, lower, _row(level, row))
+    return _over_neighbours(way, side, row, lower, lanes.row(level, row))
 
 
 def _over_neighbours(
@@ -212,8 +216,8 @@ def _levels(
             def branch(lowest: Lowest) -> Callable[..., tuple[jax.Array, ...]]:
                 def new(level: jax.Array, last: jax.Array) -> tuple[jax.Array, ...]:
                     low = lowest(way, cost, level, side, row)
-                    fell = low < _row(level, row)
-                    when = jnp.where(fell, now, _row(last, row))
+                    fell = low < lanes.row(level, row)
+                    when = jnp.where(fell, now, lanes.row(last, row))
                     return low, when, moved | fell
 
                 return new
@@ -254,19 +258,19 @@ def _steps(
     num_rows, num_edges = level.shape[0], cost.shape[0]
 
     def visit(side: jax.Array, row: jax.Array, step: jax.Array) -> jax.Array:
-        here, when = _row(level, row), _row(last, row)
+        here, when = lanes.row(level, row), lanes.row(last, row)
 
         def find(best: jax.Array, near: jax.Array, by: jax.Array) -> jax.Array:
-            there, price = _row(level, near), _row(cost, by)
+            there, price = lanes.row(level, near), lanes.row(cost, by)
             leads = (jnp.maximum(there, price) == here) & (near != row)
-            before = (_row(last, near) <= when) | (there < here)
+            before = (lanes.row(last, near) <= when) | (there < here)
             on = num_edges + way.visit[near].astype(by.dtype)
             to = jnp.where(price == here, by, on)
             return jnp.where(leads & before, to.astype(best.dtype), best)
 
         best = _over_neighbours(way, side, row, find, jnp.zeros_like(when))
         mine = when % 2 == side.astype(when.dtype)
-        best = jnp.where(mine, best, _row(step, row))
+        best = jnp.where(mine, best, lanes.row(step, row))
         return _put(step, lax.optimization_barrier(best), row)
 
     step = jnp.zeros_like(last)
@@ -287,10 +291,6 @@ def _follow(step: jax.Array, num_edges: int) -> jax.Array:
         return step, jnp.any(step >= num_edges)
 
     return lax.while_loop(lambda c: c[1], double, (step, jnp.array(True)))[0]
-
-
-def _row(x: jax.Array, i: jax.Array) -> jax.Array:
-    return lax.dynamic_slice(x, (i, jnp.uint32(0)), (1, x.shape[1]))
 
 
 def _put(x: jax.Array, row: jax.Array, i: jax.Array) -> jax.Array:

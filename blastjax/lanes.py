@@ -284,8 +284,8 @@ def _cut(way: Order, alive: jax.Array) -> jax.Array:
             packed |= jnp.where(take_rows(alive, by[:, j]), 0, bit).astype(dtype)
         return packed.reshape(*way.by.shape[:2], -1)
 
-    # Edges are read all over the place, so many times as there may be neighbours. In a
-    # lattice none has more than on average away from its faces, half of K.
+    # Every slot costs a row of edges from far away. K is twice what nodes have on one
+    # side on average; in a lattice none has more than that average, nearly.
     half = -(-width // 2)
     few = jnp.max(way.degree) <= half
     packed = lax.cond(few, lambda: pack(half), lambda: pack(width))
@@ -374,6 +374,11 @@ def take_rows(x: jax.Array, i: jax.Array) -> jax.Array:
     return lax.gather(x, i[:, None], dims, sizes, mode="promise_in_bounds")
 
 
+def row(x: jax.Array, i: jax.Array) -> jax.Array:
+    """Return row i () of x (n, T): (1, T)."""
+    return lax.dynamic_slice(x, (i, jnp.uint32(0)), (1, x.shape[1]))
+
+
 def _group(x: jax.Array, first: jax.Array) -> jax.Array:
     return lax.dynamic_slice(x, (first, jnp.uint32(0)), (GROUP, x.shape[1]))
 
@@ -419,17 +424,15 @@ def _total(rows: jax.Array) -> jax.Array:
     # So many labels add up to 16 bits. The last few may count twice.
     some = min(32, LIMIT // num_nodes, num_nodes)
 
-    def row(i: jax.Array) -> jax.Array:
-        return lax.dynamic_slice(rows, (i, jnp.uint32(0)), (1, rows.shape[1]))[0]
-
     def add(i: jax.Array, total: jax.Array) -> jax.Array:
-        # Row by row, a slice of several would be copied; and behind a barrier, fused
-        # with the wider sum vectors would be half as long.
+        # Row by row: a slice of several would be copied. Eight at a time, as many as
+        # there are registers to point at them. Behind a barrier: fused with the wider
+        # sum, vectors would be half as long.
         start = jnp.minimum(i * some, jnp.uint32(num_nodes + GROUP - some))
-        labels = [row(start + jnp.uint32(j)).astype(jnp.uint16) for j in range(some)]
-        few = [labels[j : j + 8] for j in range(0, some, 8)]
-        sums = lax.optimization_barrier([functools.reduce(jnp.add, x) for x in few])
-        return total + functools.reduce(jnp.add, sums).astype(jnp.uint32)
+        each = [row(rows, start + j).astype(jnp.uint16) for j in range(some)]
+        eights = [each[j : j + 8] for j in range(0, some, 8)]
+        sums = lax.optimization_barrier([functools.reduce(jnp.add, x) for x in eights])
+        return total + functools.reduce(jnp.add, sums)[0].astype(jnp.uint32)
 
     count = jnp.uint32(-(-num_nodes // some))
     start = jnp.zeros(rows.shape[1], jnp.uint32)

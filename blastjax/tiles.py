@@ -39,9 +39,9 @@ def vmap(function: Callable[..., Out], width: int | None = None) -> Callable[...
     def of_all(*args: Any) -> Out:
         size = _batch_size(args)
         widest = width or (WIDTH if jax.default_backend() == "cpu" else size)
-        count = -(-size // max(widest, 1))
-        if count < 2:
+        if size <= widest:
             return jax.vmap(function)(*args)
+        count = -(-size // widest)
         # As even as can be; the last tile is filled up with some of its worlds again.
         even = -(-size // count)
         spare = count * even - size
@@ -62,6 +62,7 @@ def vmap(function: Callable[..., Out], width: int | None = None) -> Callable[...
 
 
 def _batch_size(args: Any) -> int:
+    """Return T, the first size of every leaf; refuse what has none, or several."""
     sizes: dict[int, str] = {}
     for path, leaf in jax.tree_util.tree_leaves_with_path(args):
         if not jnp.shape(leaf):

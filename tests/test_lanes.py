@@ -35,6 +35,11 @@ def random_graph(kind, n, rng):
     if kind == "hub":
         star = np.stack([np.full(n - 1, n // 2), rng.permutation(n - 1)], 1)
         return np.concatenate([star, rng.integers(0, n, (n, 2))]).astype(np.int32)
+    if kind == "lattice":
+        index = np.arange(n).reshape((round(n ** (1 / 3)),) * 3)
+        along = [np.moveaxis(index, axis, 0) for axis in range(3)]
+        pairs = [np.stack([x[:-1].ravel(), x[1:].ravel()], 1) for x in along]
+        return rng.permutation(np.concatenate(pairs)).astype(np.int32)
     return rng.integers(0, n, (3 * n // 2, 2)).astype(np.int32)
 
 
@@ -47,7 +52,10 @@ def batched(n):
 
 
 @pytest.mark.parametrize("placed", [False, True])
-@pytest.mark.parametrize(("kind", "n"), [("any", 60), ("hub", 61), ("chain", 300)])
+@pytest.mark.parametrize(
+    ("kind", "n"),
+    [("any", 60), ("hub", 61), ("chain", 300), ("lattice", 125), ("lattice", 343)],
+)
 def test_a_batch_is_scipys(kind, n, placed):
     rng = np.random.default_rng(n)
     for _ in range(10):
@@ -56,6 +64,14 @@ def test_a_batch_is_scipys(kind, n, placed):
         sweep = lanes.order(edges, n, rng.random(n) if placed else None)
         found = batched(n)(jnp.asarray(edges), jnp.asarray(alive), sweep)
         np.testing.assert_array_equal(found, scipys(edges, alive, n))
+
+
+@pytest.mark.parametrize(("kind", "roomy"), [("lattice", True), ("any", False)])
+def test_both_ways_to_pack_have_their_graphs(kind, roomy):
+    """Where no node has more neighbours than half of K, and where one has."""
+    edges = random_graph(kind, 343, np.random.default_rng(343))
+    way = lanes.unpack(lanes.order(edges, 343), 343, len(edges))
+    assert (2 * int(way.degree.max()) <= way.near.shape[2]) == roomy
 
 
 @pytest.mark.parametrize(("kind", "n"), [("any", 60), ("hub", 61)])

@@ -18,17 +18,17 @@ class VmapWrapper(training.VmapWrapper):
         Args:
           env: the environment, for one.
           batch_size: keys that `reset` makes out of one; None if it is given many.
-          width: environments in a tile; see `tiles.vmap`.
+          width: environments in a tile; see `tiles.vmap`, which refuses one below 1.
         """
         super().__init__(env, batch_size)
         self.width = width
 
     def reset(self, rng: jax.Array) -> State:
-        """Start an episode in each environment."""
+        """Start an episode in each environment, by one key for all or (T, 2)."""
         if self.batch_size is not None:
             rng = jax.random.split(rng, self.batch_size)
         return tiles.vmap(self.env.reset, self.width)(rng)
 
     def step(self, state: State, action: jax.Array) -> State:
-        """Take a step in each environment."""
+        """Take a step in each environment, actions (T, n)."""
         return tiles.vmap(self.env.step, self.width)(state, action)
