@@ -422,6 +422,7 @@ NO_DERIVATIVES = {
     "stress.structures": "host",
     "stress.two_level_method": "equilibrium.solve",
     "sums": "chunks.moments",
+    "tiles": "those of jax.vmap: test_tiles",
     "wrappers": "host",
 }
 """The same for whole rooms and modules."""
