@@ -33,6 +33,8 @@ FLOOR = """
 """
 STILL = 1e-3
 """m/s, of the fastest piece's centre of mass."""
+TUMBLING = 0.1
+"""m/s, likewise: what is faster has not come to lie yet."""
 TIMESTEP = 0.004
 SLAB = np.array([0.5, 0.4, 0.08])
 DROPS = (0.1, 0.2, 0.3, 0.45, 0.6)
@@ -106,6 +108,7 @@ def fallen(scene, seconds):
 def judged(track):
     """Return how still and how deep pieces lie, from the numbers of a fall."""
     last, still = track[-50:], np.flatnonzero(track[:, 0] > STILL)
+    tumbled = np.flatnonzero(track[:, 0] > TUMBLING)
     broke = np.flatnonzero(np.diff(track[:, 3])) + 1
     return {
         "actors": int(last[-1, 3]),
@@ -113,6 +116,7 @@ def judged(track):
         "penetration": float(last[:, 1].max()),
         "lowest_moved": float(np.ptp(last[:, 2])),
         "still_after": float((still[-1] + 1 if still.size else 0) * TIMESTEP),
+        "settled_in": float((still[-1] - tumbled[-1]) * TIMESTEP),
         "broke_at": float(broke[:1].sum() * TIMESTEP),
         "last_broke_at": float(broke[-1:].sum() * TIMESTEP),
         "residual": float(last[:, 4].max()),
@@ -292,7 +296,8 @@ def main():
     if options.only == "falls":
         result["falls"] = rows = []
         print(
-            "solid friction seed drop m  still from s  since last break  depth mm  m/s"
+            "solid friction seed drop m  still from s  since last break  "
+            "since tumbling  depth mm  m/s"
         )
         for kind, seeds in (("slab", (3, 4)), ("vase", (1, 5))):
             for seed, friction in itertools.product(seeds, (0.5, 1.0)):
@@ -304,6 +309,7 @@ def main():
                         f"{kind:5} {friction:8.1f} {seed:4} {row['drop']:6.2f} "
                         f"{row['still_after']:12.2f} "
                         f"{row['still_after'] - row['last_broke_at']:16.2f} "
+                        f"{row['settled_in']:15.2f} "
                         f"{row['penetration'] * 1e3:8.2f}  {row['speed']:.0e}",
                         flush=True,
                     )
