@@ -92,12 +92,32 @@ def rotate(vector: jax.Array, quaternion: jax.Array) -> jax.Array:
     return vector + w * turn + jnp.cross(axis, turn)
 
 
+def unit_quaternion(quaternion: jax.Array) -> jax.Array:
+    """Return (..., 4) quaternions at length 1, or zero where they have no length.
+
+    Differentiable; the derivative at zero is one over a length of one.
+    """
+    square = jnp.sum(quaternion * quaternion, axis=-1, keepdims=True)
+    return quaternion * jax.lax.rsqrt(jnp.where(square > 0, square, 1.0))
+
+
 def conjugate(quaternion: jax.Array) -> jax.Array:
     """Return the inverse rotation of (..., 4) unit quaternions.
 
     Differentiable, exactly.
     """
     return jnp.concatenate([quaternion[..., :1], -quaternion[..., 1:]], axis=-1)
+
+
+def multiply(first: jax.Array, second: jax.Array) -> jax.Array:
+    """Return the rotations by second, then by first, of (..., 4) unit quaternions.
+
+    Differentiable, exactly.
+    """
+    a, b = first[..., :1], second[..., :1]
+    u, v = first[..., 1:], second[..., 1:]
+    axis = a * v + b * u + jnp.cross(u, v)
+    return jnp.concatenate([a * b - dot(u, v)[..., None], axis], axis=-1)
 
 
 def matrix(quaternion: jax.Array) -> jax.Array:

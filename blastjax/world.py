@@ -47,8 +47,9 @@ class World(pytree.Node):
     """Everything in a scene that changes."""
 
     data: mjx.Data
-    """MJX's data: positions, velocities, controls; poses as the step found them. No
-    constraint Jacobian and inertia matrix: each step makes them anew."""
+    """MJX's data: positions, velocities, controls; poses as the step found them. Axes
+    and velocities of bodies only where the user's joints, sensors or cameras ask for
+    them. No constraint Jacobian and inertia matrix: each step makes them anew."""
     state: State
     """Healths and actors."""
     bodies: bodies.Bodies
@@ -225,19 +226,18 @@ def step(
     model = bodies.weigh(scene, riding)
     frames = bodies.frames(scene, riding, data)
 
-    data = bodies.place(scene, riding, data)
-    data = bodies.kinematics(scene, model, riding, data)
+    data, own = bodies.kinematics(scene, model, riding, frames, data)
     data, found = contact.collide(scene, riding, model, data)
     data = engine.position_sensors(model, data)
-    data = bodies.accelerate(scene, model, riding, frames, data)
-    data, report = rows.resolve(scene, model, data, riding, frames, found.riders)
+    data, own = bodies.accelerate(scene, model, riding, frames, data, own)
+    data, report = rows.resolve(scene, model, data, own, riding, frames, found.riders)
     if scene.resting is None:
-        data = engine.integrate(model, data, scene.users)
+        data = engine.integrate(model, data, own)
     else:
         solved = data.qacc
         data, riding = resting.resist(scene, model, riding, frames, found.riders, data)
         # The solver's own answer is the better guess for its next one.
-        data = engine.integrate(model, data, scene.users)
+        data = engine.integrate(model, data, own)
         data = data.replace(qacc_warmstart=solved)
     force = contact.normal_force(data)
 

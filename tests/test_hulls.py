@@ -432,9 +432,7 @@ def test_leaning_shards_of_a_vase_come_to_rest(dtype):
         found = [
             row
             for friction in (0.5, 1.0)
-            for row in falls(
-                "vase", 12, 1, DROPS, friction=friction, resting=Resting()
-            )
+            for row in falls("vase", 12, 1, DROPS, friction=friction, resting=Resting())
         ]
     for row in found:
         assert row["actors"] == 12

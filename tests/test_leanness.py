@@ -141,7 +141,8 @@ def worlds():
 CONTACT = {"contact._meets", "engine.contact_frame", "rows._pyramids", "solver.solve"}
 CHUNK_CONTACT = {"box.box_box", "contact._excuse_overlap"}
 GRACE = {"bodies._pass_on", "bodies.settle"}
-USER = {"engine.user_rows", "rows._user_jacobian"}
+USER = {"engine.user_rows", "engine.accelerate", "rows._user_jacobian"}
+WATCHED = {"bodies._axes", "bodies._motion"}
 STRESS = {"stress", "failure.judge", "world.bear", "world.contact_load"}
 IMPACT = {"world.impact_damage", "damage._radial"}
 CHUNK_DAMAGE = {"fracture._apply_to_chunks"}
@@ -152,7 +153,7 @@ HELD = {"world.held_weight"}
 FRACTURE = {"fracture.split", "fracture._apply_to_bonds", "bodies.reassign"}
 
 LACKS = CONTACT | CHUNK_CONTACT | GRACE | USER | STRESS | IMPACT | CHUNK_DAMAGE
-LACKS = LACKS | CROWD | HELD
+LACKS = LACKS | CROWD | HELD | WATCHED
 
 
 @pytest.mark.parametrize(

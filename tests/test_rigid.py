@@ -300,8 +300,8 @@ def test_what_the_world_holds_stays_and_lets_go():
 @jax.jit
 def find(scene, moment):
     model = bodies.weigh(scene, moment.bodies)
-    data = bodies.place(scene, moment.bodies, moment.data)
-    data = bodies.kinematics(scene, model, moment.bodies, data)
+    seen = bodies.frames(scene, moment.bodies, moment.data)
+    data, _ = bodies.kinematics(scene, model, moment.bodies, seen, moment.data)
     data, found = contact.collide(scene, moment.bodies, model, data)
     return data._impl.contact, found
 
@@ -627,11 +627,89 @@ def test_canary_robots_move_as_mjx_moves_them(x64):
     assert events.damage is None
 
 
+WATCHED = """
+<mujoco>
+  <worldbody>
+    <light pos="0 0 9"/>
+    <geom type="plane" size="0 0 .05" pos="0 0 -0.1" euler="3 0 0"/>
+    <camera name="seen" mode="targetbody" target="chunk0" pos="3 0 1"/>
+    <body name="post" pos="5 0 0" euler="0 20 10">
+      <geom size="0.1 0.2 0.3" type="box" pos="0.1 0 0.2" euler="10 0 0"/>
+      <body name="shelf" pos="0.5 0.1 0" euler="0 0 40">
+        <geom size="0.1"/><site name="top" pos="0 0.2 0" euler="0 5 0"/>
+      </body>
+    </body>
+    <body name="hand" mocap="true" pos="4 4 4">
+      <geom size="0.1" contype="0" conaffinity="0"/>
+    </body>
+    {}
+  </worldbody>
+  <sensor>
+    <framelinvel objtype="body" objname="slot0"/>
+    <frameangvel objtype="body" objname="slot1"/>
+    <framepos objtype="body" objname="chunk2"/>
+  </sensor>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize("jointed", [False, True])
+def test_bodies_are_where_mjx_puts_them(x64, jointed):
+    arm = """<body pos="2 0 1"><joint axis="0 1 0" pos="0.1 0 0"/><geom size="0.1"/>
+      <body pos="0.5 0 0"><joint type="ball"/><geom size="0.1" pos="0 0.1 0"/></body>
+    </body>"""
+    scene = build(
+        shapes.grid((3, 1, 1), EDGE, dtype=np.float64),
+        slots=3,
+        position=(0, 0, 2.0),
+        chunk_contacts=False,
+        model=WATCHED.format(arm if jointed else ""),
+    )
+    everything = Damage(bond=jnp.full(len(scene.asset.bond_area), 2.0))
+    state, _ = fracture.step(scene.asset, fracture.init(scene.asset), everything)
+    start = world.init(scene, state)
+    rng = np.random.default_rng(3)
+    data, model = start.data, bodies.weigh(scene, start.bodies)
+    data = data.replace(
+        qpos=data.qpos + 0.3 * rng.standard_normal(data.qpos.shape),
+        qvel=jnp.asarray(rng.standard_normal(data.qvel.shape)),
+        mocap_quat=data.mocap_quat.at[0].set([0.3, 0.4, 0.5, 0.6]),
+    )
+    start = start.replace(data=data)
+
+    def ours(start):
+        seen = bodies.frames(scene, start.bodies, start.data)
+        data, own = bodies.kinematics(scene, model, start.bodies, seen, start.data)
+        data = engine.position_sensors(model, data)
+        return bodies.accelerate(scene, model, start.bodies, seen, data, own)[0]
+
+    def theirs(start):
+        data = bodies.place(scene, start.bodies, start.data)
+        for stage in ("kinematics", "com_pos", "camlight", "com_vel"):
+            data = getattr(engine.smooth, stage)(model, data)
+        return engine.sensor.sensor_vel(model, engine.sensor.sensor_pos(model, data))
+
+    found, expected = jax.jit(ours)(start), jax.jit(theirs)(start)
+    names = (
+        "qpos xpos xquat xmat xipos xanchor xaxis geom_xpos geom_xmat site_xpos "
+        "site_xmat cam_xpos cam_xmat mocap_pos mocap_quat cdof cvel cdof_dot sensordata"
+    )
+    for name in names.split():
+        a, b = getattr(found, name), getattr(expected, name)
+        np.testing.assert_allclose(a, b, atol=1e-13, err_msg=name)
+    slots = scene.host.slot_body
+    np.testing.assert_array_equal(found.subtree_com[slots], found.xpos[slots])
+    assert np.abs(found.sensordata).min() > 0
+
+
 def test_canary_private_names():
     model = inspect.signature(engine.smooth.kinematics).parameters
     assert list(model) == ["m", "d"]
     for module, names in (
-        (engine.smooth, "com_pos crb transmission camlight tendon tendon_armature"),
+        (
+            engine.smooth,
+            "com_pos com_vel crb transmission camlight tendon tendon_armature",
+        ),
         (engine.forward, "fwd_velocity fwd_actuation _advance"),
         (engine.sensor, "sensor_pos sensor_vel sensor_acc"),
         (engine.support, "jac full_m"),
@@ -668,6 +746,13 @@ def test_canary_private_names():
         (
             {"model": "<mujoco><worldbody><body name='slot3'/></worldbody></mujoco>"},
             "a body 'slot3'",
+        ),
+        (
+            {
+                "model": "<mujoco><contact><exclude body1='slot0' body2='chunk0'/>"
+                "</contact></mujoco>"
+            },
+            "sensors and cameras alone",
         ),
     ],
 )

@@ -88,9 +88,7 @@ def frames(scene: Scene, bodies: Bodies, data: mjx.Data) -> Frames:
     pose, motion = data.qpos[scene.host.slot_qpos], data.qvel[scene.host.slot_dof]
     still = jnp.zeros((1, 3), pose.dtype)
     # An orientation is stored unnormalised and read normalised, as MuJoCo does.
-    turn = pose[:, 3:]
-    square = jnp.sum(turn * turn, axis=1, keepdims=True)
-    turn = turn * jax.lax.rsqrt(jnp.where(square > 0, square, 1.0))
+    turn = spatial.unit_quaternion(pose[:, 3:])
     turn = jnp.concatenate([turn, scene.quaternion[None]])
     return Frames(
         position=jnp.concatenate([pose[:, :3], scene.position[None]]),
@@ -122,12 +120,17 @@ def chunk_poses(
     Chunks that belong to no actor are parked far below.
     """
     seen = frames(scene, bodies, data)
+    position, slot = _carried(scene, bodies, seen)
+    return position, seen.quaternion[slot]
+
+
+def _carried(scene: Scene, bodies: Bodies, seen: Frames) -> tuple[jax.Array, jax.Array]:
+    """Return where each element's chunk is, (A, 3) m, and the slot that turns it."""
     rest = chunks.element_values(scene.asset, scene.asset.chunk_centroid)
     here = (bodies.slot != NONE)[:, None]
     slot = jnp.maximum(bodies.slot, 0)
     parked = jnp.asarray(PARKED, rest.dtype)[None]
-    position = jnp.where(here, to_world(seen, slot, rest), parked)
-    return position, seen.quaternion[slot]
+    return jnp.where(here, to_world(seen, slot, rest), parked), slot
 
 
 def place(scene: Scene, bodies: Bodies, data: mjx.Data) -> mjx.Data:
@@ -155,14 +158,56 @@ def weigh(scene: Scene, bodies: Bodies) -> mjx.Model:
 
 
 def kinematics(
-    scene: Scene, model: mjx.Model, bodies: Bodies, data: mjx.Data
-) -> mjx.Data:
-    """Place every body and set the inertia of all, actors included."""
-    data = engine.kinematics(model, data)
-    data = engine.set_inertia(data, scene.host.slot_body, bodies.mass, bodies.inertia)
-    if scene.users:
-        data = engine.set_inertia_matrix(model, data)
-    return data
+    scene: Scene, model: mjx.Model, bodies: Bodies, seen: Frames, data: mjx.Data
+) -> tuple[mjx.Data, engine.Own]:
+    """Place every body and geom; return the user's part, with its inertia, besides."""
+    host, slots = scene.host, scene.slots
+    own = engine.kinematics(engine.part(host.own, model, data))
+    center, slot = _carried(scene, bodies, seen)
+    position, turn = seen.position[:slots], seen.quaternion[:slots]
+
+    # Chunks come before slots, and have their geoms at their centres.
+    chunk = slot[host.element]
+    place = jnp.concatenate([center[host.element], position])
+    rotation = jnp.concatenate([seen.rotation[chunk], seen.rotation[:slots]])
+    element = host.geom_element[own.model.ngeom :]
+    axis = jnp.broadcast_to(jnp.array([0, 0, 1], place.dtype), (slots, 3))
+    rest: dict[str, jax.Array | None] = {
+        "qpos": jnp.concatenate([position, turn], axis=1).reshape(-1),
+        "mocap_pos": center[host.element],
+        "mocap_quat": seen.quaternion[chunk],
+        "xanchor": position,
+        "xaxis": axis,
+        "xpos": place,
+        "xquat": jnp.concatenate([seen.quaternion[chunk], turn]),
+        "xmat": rotation,
+        "xipos": place,
+        "ximat": rotation,
+        "geom_xpos": center[element],
+        "geom_xmat": seen.rotation[slot[element]],
+        "site_xpos": None,
+        "site_xmat": None,
+    }
+    if _watched(scene, model):
+        rest |= {"subtree_com": place, "cdof": _axes(seen.rotation[:slots])}
+    if model.ntendon:
+        rest["ten_length"] = None
+    data = engine.extended(data, own.data, rest)
+    return engine.cameras(model, data), own
+
+
+def _watched(scene: Scene, model: mjx.Model) -> bool:
+    """Return whether anything asks for more of the slots than where they are."""
+    return bool(scene.users or model.nsensor or model.ncam)
+
+
+def _axes(rotation: jax.Array) -> jax.Array:
+    """Return the axes of slots turned so (K, 3, 3): (6 K, 6), as MJX has them."""
+    zero = jnp.zeros_like(rotation)
+    eye = zero + jnp.eye(3, dtype=zero.dtype)
+    linear = jnp.concatenate([zero, eye], axis=2)
+    angular = jnp.concatenate([jnp.swapaxes(rotation, 1, 2), zero], axis=2)
+    return jnp.concatenate([linear, angular], axis=1).reshape(-1, 6)
 
 
 def slot_inertia(bodies: Bodies) -> jax.Array:
@@ -175,33 +220,58 @@ def slot_inertia(bodies: Bodies) -> jax.Array:
 
 
 def accelerate(
-    scene: Scene, model: mjx.Model, bodies: Bodies, frames: Frames, data: mjx.Data
-) -> mjx.Data:
+    scene: Scene,
+    model: mjx.Model,
+    bodies: Bodies,
+    seen: Frames,
+    data: mjx.Data,
+    own: engine.Own,
+) -> tuple[mjx.Data, engine.Own]:
     """Compute the acceleration without constraints, each slot's by itself."""
-    data = engine.set_smooth_force(model, data, empty_dofs(scene, bodies))
-    host, users, slots = scene.host, scene.users, scene.slots
-    force = data.qfrc_smooth
+    host, slots = scene.host, scene.slots
+    spin = seen.spin[:slots]
     # A slot's origin is its centre of mass; it turns in its own axes.
+    weight = bodies.mass[:, None] * engine.gravity(model)
+    gyroscopic = jnp.cross(spin, _times(bodies.inertia, spin))
+    bias = jnp.concatenate([-weight, gyroscopic], axis=1)
+    bias = jnp.where((bodies.label == NONE)[:, None], 0.0, bias)
     push = data.xfrc_applied[host.slot_body]
-    back = jnp.swapaxes(frames.rotation[:slots], 1, 2)
-    torque = _times(back, push[:, 3:])
-    force = force.at[host.slot_dof].add(jnp.concatenate([push[:, :3], torque], axis=1))
-    own = force[host.slot_dof]
+    back = jnp.swapaxes(seen.rotation[:slots], 1, 2)
+    push = jnp.concatenate([push[:, :3], _times(back, push[:, 3:])], axis=1)
+    force = data.qfrc_applied[host.slot_dof] + push - bias
     # By a factor: an inverse of a needle's inertia would lose what turns it over.
-    moving = solver.divide_blocks(slot_inertia(bodies), own.T).T
-    found = jnp.zeros_like(force).at[host.slot_dof].set(moving)
-    if users:
-        body = np.setdiff1d(np.flatnonzero(host.model.body_weldid), host.slot_body)
-        force = force.at[:users].add(engine.pushes(model, data, body, users))
-        inertia = engine.mass_matrix(model, data)[:users, :users]
-        found = found.at[:users].set(engine.divide(inertia, force[:users]))
-    return data.replace(qfrc_smooth=force, qacc_smooth=found)
+    moving = solver.divide_blocks(slot_inertia(bodies), force.T).T
+    rest: dict[str, jax.Array | None] = {
+        "qfrc_bias": bias.reshape(-1),
+        "qfrc_smooth": force.reshape(-1),
+        "qacc_smooth": moving.reshape(-1),
+    }
+    if scene.users:
+        own = engine.accelerate(own)
+        nothing = jnp.zeros_like(bias).reshape(-1)
+        rest |= dict.fromkeys(engine.JOINT_FORCES, nothing)
+        rest |= dict.fromkeys(engine.ACTUATION)
+    if _watched(scene, model):
+        rest |= _motion(scene, bodies, seen)
+    data = engine.extended(data, own.data, rest)
+    return engine.velocity_sensors(model, data), own
 
 
-def empty_dofs(scene: Scene, bodies: Bodies) -> jax.Array:
-    """Return the degrees of freedom of empty slots, (V,) bool."""
-    empty = jnp.broadcast_to((bodies.label == NONE)[:, None], scene.host.slot_dof.shape)
-    return jnp.zeros(scene.model.nv, bool).at[scene.host.slot_dof].set(empty)
+def _motion(scene: Scene, bodies: Bodies, seen: Frames) -> dict[str, jax.Array]:
+    """Return what MJX says of how bodies move, of chunks (nothing) and of slots."""
+    slots = scene.slots
+    turn, velocity = seen.rotation[:slots], seen.velocity[:slots]
+    back = jnp.swapaxes(turn, 1, 2)
+    motion = jnp.concatenate([_times(turn, seen.spin[:slots]), velocity], axis=1)
+    inertia = engine.composite(bodies.mass, turn @ bodies.inertia @ back)
+    drift = jnp.zeros((slots, 6, 6), turn.dtype)
+    drift = drift.at[:, 3:, 3:].set(jnp.cross(velocity[:, None], back))
+    still = len(scene.host.element)
+    return {
+        "cvel": jnp.pad(motion, ((still, 0), (0, 0))),
+        "cdof_dot": drift.reshape(-1, 6),
+        "_impl.cinert": jnp.pad(inertia, ((still, 0), (0, 0))),
+    }
 
 
 def outcasts(scene: Scene, state: State) -> jax.Array:

@@ -3,12 +3,15 @@
 MJX's own `forward` cannot be told which body a geom belongs to at run time, nor replace
 the inertia of a body by a full tensor; its stages can. They are private and may move
 between releases, so they are all called here, and `tests/test_rigid.py` watches them.
-Every function maps (model, data) to data, as MJX's do.
+Of the bodies, MJX moves those of the user alone (`Own`): the library's own are free or
+carried, and `bodies` places them in closed form, which is faster to run and to
+compile.
 """
 
 import dataclasses
 import functools
 from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +29,7 @@ from mujoco.mjx._src import (
 )
 from mujoco.mjx._src import math as mjx_math
 
+from blastjax import spatial
 from blastjax.rigid import solver
 
 Points = tuple[jax.Array, jax.Array, jax.Array]
@@ -34,6 +38,30 @@ Points = tuple[jax.Array, jax.Array, jax.Array]
 LEAST = mujoco.mjMINVAL
 """Least softness of a constraint."""
 _ROWS = ("D", "aref", "pos", "margin", "frictionloss")
+JOINT_FORCES = "qfrc_passive", "qfrc_gravcomp", "qfrc_actuator"
+"""What acts on the user's joints and not on slots."""
+ACTUATION = (
+    "act_dot",
+    "actuator_force",
+    "actuator_length",
+    "_impl.actuator_velocity",
+    "_impl.ten_velocity",
+)
+"""What is of actuators and tendons, all the user's."""
+_GIVEN = (
+    "time",
+    "qpos",
+    "qvel",
+    "act",
+    "history",
+    "ctrl",
+    "qfrc_applied",
+    "xfrc_applied",
+    "eq_active",
+    "mocap_pos",
+    "mocap_quat",
+)
+"""What MJX's stages start from."""
 _UPPER = ((0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2))
 
 
@@ -42,46 +70,115 @@ def numeric(model: mjx.Model, name: str) -> int:
     return collision_driver._numeric(model, name)
 
 
-def kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Place every body, and find the axes of motion about the centres of mass."""
-    data = smooth.kinematics(model, data)
-    data = smooth.com_pos(model, data)
-    if model.ncam:
-        data = smooth.camlight(model, data)
-    if not model.ntendon:
-        return data
-    found = smooth.tendon(model, data)
-    # With x64 it makes some counts wider than it was given them.
-    kept = jax.tree.map(lambda x, old: x.astype(old.dtype), found._impl, data._impl)
-    return found.replace(_impl=kept)
+class Own(NamedTuple):
+    """The user's own bodies, as if nothing had been added to their model.
 
-
-def set_inertia(
-    data: mjx.Data, body: np.ndarray, mass: jax.Array, inertia: jax.Array
-) -> mjx.Data:
-    """Give bodies (K,) their mass (K,) and inertia (K, 3, 3), in the axes of each body.
-
-    The whole tensor goes in, without principal axes: an eigenvector of a cube's inertia
-    has no derivative.
+    All that the library adds comes after what is the user's, so that arrays of these
+    are the beginnings of those of the whole.
     """
-    turn = data.xmat[body]
-    spatial_inertia = turn @ inertia @ jnp.swapaxes(turn, 1, 2)
-    entries = jnp.concatenate(
-        [
-            spatial_inertia[:, _UPPER[0], _UPPER[1]],
-            jnp.zeros_like(mass)[:, None].repeat(3, 1),
-            mass[:, None],
-        ],
-        axis=1,
+
+    model: mjx.Model
+    data: mjx.Data
+
+
+def own(model: mujoco.MjModel) -> Own:
+    """Return the user's own model, on the host."""
+    device = mjx.put_model(model, impl="jax")
+    return jax.tree.map(np.asarray, Own(device, mjx.make_data(device, impl="jax")))
+
+
+def part(template: Own, model: mjx.Model, data: mjx.Data) -> Own:
+    """Return the user's part of a model and its data."""
+
+    def begin(own: np.ndarray | jax.Array, whole: jax.Array) -> jax.Array:
+        return jnp.asarray(whole)[tuple(map(slice, own.shape))]
+
+    leaves, shape = jax.tree.flatten(template.model)
+    whole = zip(leaves, jax.tree.leaves(model), strict=True)
+    blank = jax.tree.map(jnp.asarray, template.data)
+    known = {name: begin(getattr(blank, name), getattr(data, name)) for name in _GIVEN}
+    return Own(
+        jax.tree.unflatten(shape, [begin(*pair) for pair in whole]),
+        blank.replace(**known),
     )
-    cinert = data._impl.cinert.at[body].set(entries)
-    return data.tree_replace({"_impl.cinert": cinert})
 
 
-def set_inertia_matrix(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Compute the joint-space inertia matrix."""
+def extended(
+    data: mjx.Data, user: mjx.Data, rest: dict[str, jax.Array | None]
+) -> mjx.Data:
+    """Put the user's arrays into the whole, each followed by the rest, if it has any.
+
+    Names with a prefix `_impl.` are of MJX's inner data.
+    """
+
+    def joined(name: str, after: jax.Array | None) -> jax.Array:
+        inner = name.removeprefix("_impl.")
+        first = getattr(user if inner == name else user._impl, inner)
+        return first if after is None else jnp.concatenate([first, after])
+
+    return data.tree_replace({name: joined(name, x) for name, x in rest.items()})
+
+
+def kinematics(own: Own) -> Own:
+    """Place the user's bodies, and find their axes of motion and their inertia."""
+    model, data = own
+    if not model.nv:
+        # MJX has no way through a tree without joints.
+        return Own(model, _without_joints(model, data))
+    data = smooth.com_pos(model, smooth.kinematics(model, data))
+    if model.ntendon:
+        found = smooth.tendon(model, data)
+        # With x64 it makes some counts wider than it was given them.
+        kept = jax.tree.map(lambda x, old: x.astype(old.dtype), found._impl, data._impl)
+        data = found.replace(_impl=kept)
     data = smooth.crb(model, data)
-    return smooth.tendon_armature(model, data) if model.ntendon else data
+    data = smooth.tendon_armature(model, data) if model.ntendon else data
+    return Own(model, data)
+
+
+def _without_joints(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Place bodies that are fixed to the world or to a mocap body."""
+    place = jnp.zeros_like(model.body_pos)
+    turn = jnp.zeros_like(model.body_quat).at[:, 0].set(1.0)
+    parent = np.asarray(model.body_parentid)
+    body = np.flatnonzero(parent == 0)[1:]
+    while body.size:
+        up = parent[body]
+        local = model.body_pos[body], model.body_quat[body]
+        place = place.at[body].set(place[up] + spatial.rotate(local[0], turn[up]))
+        turn = turn.at[body].set(spatial.multiply(turn[up], local[1]))
+        moved = body[model.body_mocapid[body] >= 0]
+        mocap = model.body_mocapid[moved]
+        place = place.at[moved].set(data.mocap_pos[mocap])
+        turn = turn.at[moved].set(spatial.unit_quaternion(data.mocap_quat[mocap]))
+        body = np.flatnonzero(np.isin(parent, body) & (parent > 0))
+
+    def on(
+        body: np.ndarray, position: jax.Array, quaternion: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        center = place[body] + spatial.rotate(position, turn[body])
+        return center, spatial.matrix(spatial.multiply(turn[body], quaternion))
+
+    center, axes = on(np.arange(len(parent)), model.body_ipos, model.body_iquat)
+    geom = on(model.geom_bodyid, model.geom_pos, model.geom_quat)
+    site = on(model.site_bodyid, model.site_pos, model.site_quat)
+    return data.replace(
+        xpos=place,
+        xquat=turn,
+        xmat=spatial.matrix(turn),
+        xipos=center,
+        ximat=axes,
+        geom_xpos=geom[0],
+        geom_xmat=geom[1],
+        site_xpos=site[0],
+        site_xmat=site[1],
+        subtree_com=center,
+    )
+
+
+def cameras(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Place the cameras, where there are any."""
+    return smooth.camlight(model, data) if model.ncam else data
 
 
 def geom_pairs(model: mujoco.MjModel) -> np.ndarray:
@@ -189,26 +286,22 @@ def impedance(
 
 
 def point_jacobian(
-    model: mjx.Model,
-    data: mjx.Data,
-    point: jax.Array,
-    body: jax.Array | np.ndarray,
-    count: int,
+    own: Own, point: jax.Array, body: jax.Array | np.ndarray
 ) -> tuple[jax.Array, jax.Array]:
-    """Return how points (n, 3) on bodies (n,) move and turn, each (n, count, 3).
+    """Return how points (n, 3) on the user's bodies (n,) move and turn by their joints.
 
-    By the first `count` degrees of freedom.
+    Each is (n, U, 3).
     """
-    linear, angular = jax.vmap(functools.partial(support.jac, model, data))(point, body)
-    return linear[:, :count], angular[:, :count]
+    return jax.vmap(functools.partial(support.jac, *own))(point, body)
 
 
-def user_rows(model: mjx.Model, data: mjx.Data, count: int) -> solver.Rows | None:
-    """Return the constraints that are no contacts, on the first `count` joints.
+def user_rows(own: Own) -> solver.Rows | None:
+    """Return the constraints that are no contacts, on the user's joints.
 
     Equality rows pull and push, dry friction is bounded, limits only push; a force is
     counted as minus the derivative of the cost, so pushing is the lower side.
     """
+    model, data = own
     impl = data._impl
     equality, dry = impl.ne, impl.nf
     if equality + dry + impl.nl == 0:
@@ -220,7 +313,7 @@ def user_rows(model: mjx.Model, data: mjx.Data, count: int) -> solver.Rows | Non
     pulls, rubs = row < equality, (row >= equality) & (row < equality + dry)
     endless = jnp.full_like(friction, jnp.inf)
     return solver.Rows(
-        jacobian=made.efc_J[:, :count],
+        jacobian=made.efc_J,
         stiffness=made.efc_D,
         reference=made.efc_aref,
         lower=jnp.where(rubs, -friction, -endless),
@@ -228,26 +321,37 @@ def user_rows(model: mjx.Model, data: mjx.Data, count: int) -> solver.Rows | Non
     )
 
 
-def set_smooth_force(model: mjx.Model, data: mjx.Data, frozen: jax.Array) -> mjx.Data:
-    """Compute the forces without constraints; frozen dofs (V,) feel no bias.
-
-    What the user applies to bodies is not among them: see `pushes`.
-    """
+def accelerate(own: Own) -> Own:
+    """Compute the acceleration of the user's joints, constraints aside."""
+    model, data = own
     data = smooth.transmission(model, data)
     data = forward.fwd_velocity(model, data)
-    data = sensor.sensor_vel(model, data) if model.nsensor else data
     data = forward.fwd_actuation(model, data)
-    bias = jnp.where(frozen, 0.0, data.qfrc_bias)
-    force = data.qfrc_passive - bias + data.qfrc_actuator + data.qfrc_applied
-    return data.replace(qfrc_bias=bias, qfrc_smooth=force)
+    force = data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator
+    force = force + data.qfrc_applied + _pushes(Own(model, data))
+    free = divide(mass_matrix(own), force)
+    return Own(model, data.replace(qfrc_smooth=force, qacc_smooth=free))
 
 
-def pushes(model: mjx.Model, data: mjx.Data, body: np.ndarray, count: int) -> jax.Array:
-    """Return what the user applies to bodies (n,), by the first `count` dofs."""
-    linear, angular = point_jacobian(model, data, data.xipos[body], body, count)
-    push = data.xfrc_applied[body]
+def _pushes(own: Own) -> jax.Array:
+    """Return what the user applies to their bodies, by their joints, (U,)."""
+    body = np.flatnonzero(own.model.body_weldid)
+    linear, angular = point_jacobian(own, own.data.xipos[body], body)
+    push = own.data.xfrc_applied[body]
     moved = jnp.concatenate([linear, angular], axis=2)
     return jnp.einsum("nui,ni->u", moved, push, precision="highest")
+
+
+def composite(mass: jax.Array, inertia: jax.Array) -> jax.Array:
+    """Return mass (n,) and inertia (n, 3, 3) about the centre as MJX has it, (n, 10).
+
+    The whole tensor goes in, without principal axes: an eigenvector of a cube's inertia
+    has no derivative.
+    """
+    offset = jnp.zeros((len(mass), 3), mass.dtype)
+    return jnp.concatenate(
+        [inertia[:, _UPPER[0], _UPPER[1]], offset, mass[:, None]], axis=1
+    )
 
 
 def without_matrices(data: mjx.Data) -> mjx.Data:
@@ -268,9 +372,20 @@ def position_sensors(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     return sensor.sensor_pos(model, data) if model.nsensor else data
 
 
-def mass_matrix(model: mjx.Model, data: mjx.Data) -> jax.Array:
-    """Return the joint-space inertia matrix, (V, V)."""
-    return support.full_m(model, data)
+def velocity_sensors(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Read the sensors of velocity, where there are any."""
+    return sensor.sensor_vel(model, data) if model.nsensor else data
+
+
+def gravity(model: mjx.Model) -> jax.Array:
+    """Return the acceleration of free fall, (3,) m/s^2."""
+    off = model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY
+    return jnp.zeros_like(model.opt.gravity) if off else model.opt.gravity
+
+
+def mass_matrix(own: Own) -> jax.Array:
+    """Return the joint-space inertia matrix of the user's joints, (U, U)."""
+    return support.full_m(*own)
 
 
 def normal_force(data: mjx.Data) -> jax.Array:
@@ -337,30 +452,29 @@ def contact_force(data: mjx.Data) -> jax.Array:
     return jnp.einsum("ni,nij->nj", local, touch.frame)
 
 
-def integrate(model: mjx.Model, data: mjx.Data, users: int) -> mjx.Data:
+def integrate(model: mjx.Model, data: mjx.Data, own: Own) -> mjx.Data:
     """Advance one time step by the model's integrator.
 
-    What damps implicitly are the first `users` joints: slots have no damping.
+    What damps implicitly are the user's joints: slots have no damping.
     """
     data = sensor.sensor_acc(model, data) if model.nsensor else data
-    acceleration = data.qacc
-    slope = _damping(model, data, users) if users else None
+    acceleration, users = data.qacc, own.model.nv
+    slope = _damping(own) if users else None
     if slope is not None:
-        inertia = mass_matrix(model, data)[:users, :users]
+        damped = mass_matrix(own) - model.opt.timestep * slope
         force = (data.qfrc_smooth + data.qfrc_constraint)[:users]
-        damped = inertia - model.opt.timestep * slope
         acceleration = acceleration.at[:users].set(divide(damped, force))
     return forward._advance(model, data, data.act_dot, acceleration)
 
 
-def _damping(model: mjx.Model, data: mjx.Data, users: int) -> jax.Array | None:
+def _damping(own: Own) -> jax.Array | None:
     """Return how the force on the user's joints changes by velocity, or None."""
+    model, data = own
     if model.opt.integrator != mujoco.mjtIntegrator.mjINT_EULER:
-        slope = derivative.deriv_smooth_vel(model, data)
-        return None if slope is None else slope[:users, :users]
+        return derivative.deriv_smooth_vel(model, data)
     if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP:
         return None
-    return -jnp.diag(model.dof_damping[:users])
+    return -jnp.diag(model.dof_damping)
 
 
 def divide(matrix: jax.Array, right: jax.Array) -> jax.Array:

@@ -20,21 +20,21 @@ def problem(
     scene: Scene,
     model: mjx.Model,
     data: mjx.Data,
+    own: engine.Own,
     bodies: Bodies,
     frames: Frames,
     carried: Riders,
 ) -> solver.Problem:
     """Return the contact problem of this step."""
-    users = scene.users
     inertia = jnp.zeros((0, 0), data.qvel.dtype)
-    if users:
-        inertia = engine.mass_matrix(model, data)[:users, :users]
+    if scene.users:
+        inertia = engine.mass_matrix(own)
     return solver.Problem(
         user_inertia=inertia,
         slot_inertia=slot_inertia(bodies),
         free=motion(scene, data.qacc_smooth),
-        rows=engine.user_rows(model, data, users),
-        contacts=_contacts(scene, model, data, frames, carried),
+        rows=engine.user_rows(own),
+        contacts=_contacts(scene, model, data, own, frames, carried),
     )
 
 
@@ -42,12 +42,13 @@ def resolve(
     scene: Scene,
     model: mjx.Model,
     data: mjx.Data,
+    own: engine.Own,
     bodies: Bodies,
     frames: Frames,
     carried: Riders,
 ) -> tuple[mjx.Data, solver.Report]:
     """Solve for the acceleration and the constraint forces."""
-    posed = problem(scene, model, data, bodies, frames, carried)
+    posed = problem(scene, model, data, own, bodies, frames, carried)
     if posed.rows is None and not posed.contacts:
         free = data.replace(qacc=data.qacc_smooth)
         # Nothing to solve, and nothing to hide: what is not finite stays so.
@@ -98,12 +99,14 @@ def _contacts(
     scene: Scene,
     model: mjx.Model,
     data: mjx.Data,
+    own: engine.Own,
     frames: Frames,
     carried: Riders,
 ) -> tuple[solver.Contacts, ...]:
     found = []
     for size, contacts in engine.contacts_by_size(data):
-        found.append(_pyramids(scene, model, data, frames, carried, size, contacts))
+        made = _pyramids(scene, model, data, own, frames, carried, size, contacts)
+        found.append(made)
     return tuple(found)
 
 
@@ -111,6 +114,7 @@ def _pyramids(
     scene: Scene,
     model: mjx.Model,
     data: mjx.Data,
+    own: engine.Own,
     frames: Frames,
     carried: Riders,
     size: int,
@@ -133,7 +137,7 @@ def _pyramids(
         sides.append((slot, jacobian))
     user = None
     if scene.host.user_meets:
-        user = _user_jacobian(scene, model, data, contacts, size) * scale[..., None]
+        user = _user_jacobian(scene, own, contacts, size) * scale[..., None]
 
     unset = jnp.zeros_like(depth), jnp.zeros_like(scale)
     found = solver.Contacts(tuple(sides), user, *unset)
@@ -188,18 +192,13 @@ def _rotate_back(turn: jax.Array, vector: jax.Array) -> jax.Array:
 
 
 def _user_jacobian(
-    scene: Scene,
-    model: mjx.Model,
-    data: mjx.Data,
-    contacts: mjx.Contact,
-    size: int,
+    scene: Scene, own: engine.Own, contacts: mjx.Contact, size: int
 ) -> jax.Array:
     """Return the motion of contacts by the user's joints, (D, C, U)."""
     # The bodies of chunks are on no joint, so they add nothing.
     body = jnp.asarray(scene.host.geom_weld, jnp.int32)[contacts.geom]
     first, second = (
-        engine.point_jacobian(model, data, contacts.pos, body[:, side], scene.users)
-        for side in (0, 1)
+        engine.point_jacobian(own, contacts.pos, body[:, side]) for side in (0, 1)
     )
     linear, angular = second[0] - first[0], second[1] - first[1]
     along = jnp.einsum("cij,cuj->icu", contacts.frame, linear)

@@ -44,6 +44,8 @@ class Host:
     model: mujoco.MjModel
     """The compiled model, for rendering and for MuJoCo C; chunks with meshes have them
     as geoms in it."""
+    own: engine.Own
+    """What the user's model is without the breakable."""
     slot_body: np.ndarray
     """(K,) body of each slot."""
     slot_qpos: np.ndarray
@@ -162,6 +164,8 @@ def build(
       resting: how what lies comes to rest. By default by the contacts of MuJoCo alone,
         which creep, and nothing of it is in the program.
       model: MJCF as a string, a path or an MjSpec (left as it is). By default a floor.
+        Its sensors and cameras may name chunks and slots. Wind and drag act on its own
+        bodies, not on chunks.
       timestep: s; by default the model's own.
       iterations: most Newton steps of the contact solver.
       line_search: steps of each of its line searches.
@@ -221,6 +225,7 @@ def build(
         _positive("tolerance", tolerance, zero=True)
         spec.option.tolerance = tolerance
     spec.option.iterations = iterations
+    alone = _alone(spec)
     bits = (1, 1) if chunk_contacts else _bits_without_chunk_pairs(spec)
     shapes = _chunk_shapes(asset, elements, collision, hulls)
     _add_chunks(spec, asset, elements, place, turn / length, shapes, friction, bits)
@@ -231,11 +236,12 @@ def build(
     compiled = spec.compile()
     # MJX would factor the inertia a second time at each step to damp nothing.
     if not compiled.dof_damping.any():
-        compiled.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
+        for each in (compiled, alone):
+            each.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
 
     device = mjx.put_model(compiled, impl="jax")
     dtype = device.qpos0.dtype
-    addresses = _host(compiled, slots, elements)
+    addresses = _host(compiled, engine.own(alone), slots, elements)
     table = None
     if hulls is not None:
         table, reach = tables.of_geoms(compiled, addresses.geom_element, asset, hulls)
@@ -462,7 +468,26 @@ def _cap(spec: mujoco.MjSpec, name: str, value: int) -> None:
         spec.add_numeric(name=name, data=[value])
 
 
-def _host(model: mujoco.MjModel, slots: int, elements: np.ndarray) -> Host:
+def _alone(spec: mujoco.MjSpec) -> mujoco.MjModel:
+    """Compile the user's model before anything is added to it.
+
+    Without what watches it, which may watch the breakable too.
+    """
+    spec = spec.copy()
+    for watcher in [*spec.sensors, *spec.cameras]:
+        spec.delete(watcher)
+    try:
+        return spec.compile()
+    except ValueError as error:
+        raise ValueError(
+            f"the model does not compile without the breakable: {error}; of all that "
+            "is in it, sensors and cameras alone may name chunks and slots"
+        ) from error
+
+
+def _host(
+    model: mujoco.MjModel, own: engine.Own, slots: int, elements: np.ndarray
+) -> Host:
     def body(name: str) -> int:
         return mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)
 
@@ -476,6 +501,7 @@ def _host(model: mujoco.MjModel, slots: int, elements: np.ndarray) -> Host:
     weld = model.body_weldid[model.geom_bodyid]
     return Host(
         model=model,
+        own=own,
         slot_body=slot_body,
         slot_qpos=model.jnt_qposadr[joint][:, None] + np.arange(7),
         slot_dof=model.jnt_dofadr[joint][:, None] + np.arange(6),
