@@ -49,7 +49,7 @@ class World(pytree.Node):
     data: mjx.Data
     """MJX's data: positions, velocities, controls; poses as the step found them. Axes
     and velocities of bodies only where the user's joints, sensors or cameras ask for
-    them. No constraint Jacobian and inertia matrix: each step makes them anew."""
+    them. No constraint Jacobian and inertia matrix: steps need none of the whole."""
     state: State
     """Healths and actors."""
     bodies: bodies.Bodies
@@ -153,7 +153,7 @@ def init(
     """
     if state is None:
         state = fracture.init(scene.asset, bond_health, chunk_health)
-    data = engine.without_matrices(contact.make_data(scene))
+    data = engine.lean(contact.make_data(scene), scene.watched)
     return _begin(scene, data, state, velocity, spin, remove_dead)
 
 
@@ -242,7 +242,7 @@ def step(
     force = contact.normal_force(data)
 
     world = world.replace(
-        data=engine.without_matrices(data),
+        data=data,
         bodies=bodies.settle(scene, riding.replace(overlap=found.overlap)),
         dropped=jax.tree.map(jnp.add, world.dropped, found.dropped),
     )

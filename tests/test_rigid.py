@@ -749,10 +749,10 @@ def test_canary_private_names():
         ),
         (
             {
-                "model": "<mujoco><contact><exclude body1='slot0' body2='chunk0'/>"
-                "</contact></mujoco>"
+                "model": "<mujoco><equality><weld body1='slot0' body2='world'/>"
+                "</equality></mujoco>"
             },
-            "sensors and cameras alone",
+            "an equality constraint of the model is on a chunk or a slot",
         ),
     ],
 )

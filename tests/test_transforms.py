@@ -321,6 +321,9 @@ TABLE = {
     "spatial.matrix": lambda a, s, x: spatial.matrix(
         spatial.unit(jnp.array([1, 2, 3], jnp.float32) * x)[jnp.array([0, 1, 2, 0])]
     ),
+    "spatial.multiply": lambda a, s, x: spatial.multiply(
+        jnp.array([1, 2, 3, 4], jnp.float32) * x, jnp.array([4, 2, 1, 3], jnp.float32)
+    ),
     "spatial.norm": lambda a, s, x: spatial.norm(AT * x - AT),
     "spatial.point_to_segment": lambda a, s, x: spatial.point_to_segment(
         AT * x, TO, UP
@@ -333,6 +336,9 @@ TABLE = {
         AT[None], TO[None] * x, CORNERS
     ),
     "spatial.unit": lambda a, s, x: spatial.unit(AT * x - AT),
+    "spatial.unit_quaternion": lambda a, s, x: spatial.unit_quaternion(
+        jnp.array([1, 2, 3, 4], jnp.float32) * x - jnp.array([1, 2, 3, 4], jnp.float32)
+    ),
 }
 
 

@@ -188,17 +188,12 @@ def kinematics(
         "site_xpos": None,
         "site_xmat": None,
     }
-    if _watched(scene, model):
+    if scene.watched:
         rest |= {"subtree_com": place, "cdof": _axes(seen.rotation[:slots])}
     if model.ntendon:
         rest["ten_length"] = None
     data = engine.extended(data, own.data, rest)
     return engine.cameras(model, data), own
-
-
-def _watched(scene: Scene, model: mjx.Model) -> bool:
-    """Return whether anything asks for more of the slots than where they are."""
-    return bool(scene.users or model.nsensor or model.ncam)
 
 
 def _axes(rotation: jax.Array) -> jax.Array:
@@ -251,7 +246,7 @@ def accelerate(
         nothing = jnp.zeros_like(bias).reshape(-1)
         rest |= dict.fromkeys(engine.JOINT_FORCES, nothing)
         rest |= dict.fromkeys(engine.ACTUATION)
-    if _watched(scene, model):
+    if scene.watched:
         rest |= _motion(scene, bodies, seen)
     data = engine.extended(data, own.data, rest)
     return engine.velocity_sensors(model, data), own

@@ -37,7 +37,30 @@ Points = tuple[jax.Array, jax.Array, jax.Array]
 
 LEAST = mujoco.mjMINVAL
 """Least softness of a constraint."""
-_ROWS = ("D", "aref", "pos", "margin", "frictionloss")
+_SOLVER = (
+    "_impl.efc_type",
+    "_impl.efc_J",
+    "_impl.efc_D",
+    "_impl.efc_aref",
+    "_impl.efc_pos",
+    "_impl.efc_margin",
+    "_impl.efc_frictionloss",
+    "_impl.M",
+    "_impl.qLD",
+    "_impl.crb",
+)
+"""What MJX's solver works with, and ours does not."""
+_MOTION = (
+    "subtree_com",
+    "cdof",
+    "cdof_dot",
+    "cvel",
+    "_impl.cinert",
+    "_impl.cacc",
+    "_impl.cfrc_int",
+    "_impl.cfrc_ext",
+)
+"""How bodies move, and what of their forces sensors derive."""
 JOINT_FORCES = "qfrc_passive", "qfrc_gravcomp", "qfrc_actuator"
 """What acts on the user's joints and not on slots."""
 ACTUATION = (
@@ -354,17 +377,19 @@ def composite(mass: jax.Array, inertia: jax.Array) -> jax.Array:
     )
 
 
-def without_matrices(data: mjx.Data) -> mjx.Data:
-    """Drop the matrices that every step computes anew: most of a world's bytes."""
-    impl = data._impl
-    return data.tree_replace(
-        {
-            "_impl.efc_J": jnp.zeros((0, data.qvel.shape[0]), impl.efc_J.dtype),
-            **{f"_impl.efc_{name}": jnp.zeros(0, data.qvel.dtype) for name in _ROWS},
-            "_impl.M": jnp.zeros((0,) * impl.M.ndim, impl.M.dtype),
-            "_impl.qLD": jnp.zeros((0,) * impl.qLD.ndim, impl.qLD.dtype),
-        }
-    )
+def lean(data: mjx.Data, watched: bool) -> mjx.Data:
+    """Drop what no step reads or writes: most of a world's bytes.
+
+    What says how bodies move is kept if it is watched.
+    """
+    names = _SOLVER if watched else (*_SOLVER, *_MOTION)
+
+    def nothing(name: str) -> jax.Array:
+        inner = name.removeprefix("_impl.")
+        whole = getattr(data if inner == name else data._impl, inner)
+        return jnp.zeros((0, *whole.shape[1:]), whole.dtype)
+
+    return data.tree_replace({name: nothing(name) for name in names})
 
 
 def position_sensors(model: mjx.Model, data: mjx.Data) -> mjx.Data:

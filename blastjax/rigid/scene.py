@@ -124,6 +124,11 @@ class Scene(pytree.Node):
         """U, degrees of freedom of the user's model, before those of the slots."""
         return self.model.nv - 6 * self.slots
 
+    @property
+    def watched(self) -> bool:
+        """Whether joints of the user's, sensors or cameras ask how slots move."""
+        return bool(self.users or self.model.nsensor or self.model.ncam)
+
 
 def build(
     asset: Asset | Destructible,
@@ -225,7 +230,7 @@ def build(
         _positive("tolerance", tolerance, zero=True)
         spec.option.tolerance = tolerance
     spec.option.iterations = iterations
-    alone = _alone(spec)
+    own = _own(spec)
     bits = (1, 1) if chunk_contacts else _bits_without_chunk_pairs(spec)
     shapes = _chunk_shapes(asset, elements, collision, hulls)
     _add_chunks(spec, asset, elements, place, turn / length, shapes, friction, bits)
@@ -234,14 +239,15 @@ def build(
     _cap(spec, "max_geom_pairs", max_pairs or max(64, 2 * count))
     _cap(spec, "max_contact_points", max_contacts or 16 * (slots + 1))
     compiled = spec.compile()
+    _check_own(compiled, own)
     # MJX would factor the inertia a second time at each step to damp nothing.
     if not compiled.dof_damping.any():
-        for each in (compiled, alone):
+        for each in (compiled, own):
             each.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
 
     device = mjx.put_model(compiled, impl="jax")
     dtype = device.qpos0.dtype
-    addresses = _host(compiled, engine.own(alone), slots, elements)
+    addresses = _host(compiled, engine.own(own), slots, elements)
     table = None
     if hulls is not None:
         table, reach = tables.of_geoms(compiled, addresses.geom_element, asset, hulls)
@@ -468,21 +474,27 @@ def _cap(spec: mujoco.MjSpec, name: str, value: int) -> None:
         spec.add_numeric(name=name, data=[value])
 
 
-def _alone(spec: mujoco.MjSpec) -> mujoco.MjModel:
-    """Compile the user's model before anything is added to it.
-
-    Without what watches it, which may watch the breakable too.
-    """
+def _own(spec: mujoco.MjSpec) -> mujoco.MjModel:
+    """Compile the user's model before anything is added to it."""
+    # A copy leaves out what names bodies to come, silently, but for cameras.
     spec = spec.copy()
-    for watcher in [*spec.sensors, *spec.cameras]:
-        spec.delete(watcher)
-    try:
-        return spec.compile()
-    except ValueError as error:
-        raise ValueError(
-            f"the model does not compile without the breakable: {error}; of all that "
-            "is in it, sensors and cameras alone may name chunks and slots"
-        ) from error
+    for camera in spec.cameras:
+        spec.delete(camera)
+    return spec.compile()
+
+
+def _check_own(model: mujoco.MjModel, own: mujoco.MjModel) -> None:
+    """Refuse what binds the user's bodies to the breakable: no step would see it."""
+    for name, what in (
+        ("neq", "an equality constraint"),
+        ("ntendon", "a tendon"),
+        ("nu", "an actuator"),
+    ):
+        if getattr(own, name) != getattr(model, name):
+            raise ValueError(
+                f"{what} of the model is on a chunk or a slot; of all that is in it, "
+                "only sensors, cameras and contacts may name them"
+            )
 
 
 def _host(
