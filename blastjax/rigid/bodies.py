@@ -125,7 +125,7 @@ def chunk_poses(
 
 
 def _carried(scene: Scene, bodies: Bodies, seen: Frames) -> tuple[jax.Array, jax.Array]:
-    """Return where each element's chunk is, (A, 3) m, and the slot that turns it."""
+    """Return where each chunk is, (A, 3) m, and the slot that turns it, (A,)."""
     rest = chunks.element_values(scene.asset, scene.asset.chunk_centroid)
     here = (bodies.slot != NONE)[:, None]
     slot = jnp.maximum(bodies.slot, 0)

@@ -111,7 +111,10 @@ def own(model: mujoco.MjModel) -> Own:
 
 
 def part(template: Own, model: mjx.Model, data: mjx.Data) -> Own:
-    """Return the user's part of a model and its data."""
+    """Return the user's part of a model and its data.
+
+    Arrays are the whole's of now; what MJX has as constants is the template's.
+    """
 
     def begin(own: np.ndarray | jax.Array, whole: jax.Array) -> jax.Array:
         return jnp.asarray(whole)[tuple(map(slice, own.shape))]
