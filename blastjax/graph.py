@@ -431,13 +431,16 @@ def group_count(group: jax.Array, num_groups: int) -> jax.Array:
 def _scattered(num_groups: int, kind: type) -> Kernel:
     """Return the scatter of flags (n,) to groups (n,): any of them, or how many."""
 
+    # Not `.at[]`, whose places go once more through memory. Out of range, they drop.
+    scatter_to = jax.lax.scatter if kind is bool else jax.lax.scatter_add
+    dtype = bool if kind is bool else jnp.int32
+    dims = jax.lax.ScatterDimensionNumbers((), (0,), (0,))
+
     def put(size: int, place: jax.Array) -> jax.Array:
-        if kind is bool:
-            return jnp.zeros(size, bool).at[place].set(True, mode="drop")
-        return jnp.zeros(size, jnp.int32).at[place].add(1, mode="drop")
+        zeros, ones = jnp.zeros(size, dtype), jnp.ones(place.shape, dtype)
+        return scatter_to(zeros, place[:, None], ones, dims, mode="drop")
 
     def one(flags: jax.Array, group: jax.Array) -> jax.Array:
-        # Negative numbers would count from the end; out of range, they are dropped.
         return put(num_groups, jnp.where(flags & (group >= 0), group, num_groups))
 
     scatter = jax.custom_batching.custom_vmap(one)
@@ -451,12 +454,12 @@ def _scattered(num_groups: int, kind: type) -> Kernel:
             return jax.vmap(one)(flags, group), True
         # One scatter of all, several times faster than a batch of them. Behind a
         # barrier, or its places are computed in the order of the scatter: not in
-        # vectors. Unsigned, they are not checked for counting from the end.
+        # vectors.
         everything = size * num_groups
         copy = jnp.arange(size, dtype=jnp.int32)[:, None]
         within = flags & (group >= 0) & (group < num_groups)
         place = jnp.where(within, copy * num_groups + group, everything)
-        place = jax.lax.optimization_barrier(place.astype(jnp.uint32)).reshape(-1)
+        place = jax.lax.optimization_barrier(place).reshape(-1)
         return put(everything, place).reshape(size, num_groups), True
 
     return scatter
