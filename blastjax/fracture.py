@@ -227,7 +227,7 @@ def _ends_of_any(edges: jax.Array, flag: jax.Array) -> jax.Array:
     # One by one: a gather of all at once would leave its result the other way round in
     # memory, whether it is taken or not, and all that reads it would be slow.
     return jax.lax.cond(
-        jnp.any(flag),
+        graph.any_of_many(flag),
         lambda: jax.lax.map(lambda x: x[edges[:, 0]] | x[edges[:, 1]], flag),
         lambda: jnp.zeros(shape, bool),
     )

@@ -383,7 +383,7 @@ def _search_touched(num_nodes: int) -> Kernel:
     def sweeps(edges: jax.Array, sweep: jax.Array, flags: jax.Array) -> jax.Array:
         through = lanes.unpack(sweep, num_nodes, edges.shape[0])
         return jax.lax.cond(
-            jnp.any(flags),
+            any_of_many(flags),
             lambda: lanes.tiled(lambda x: lanes.touched(through, x), bool, flags),
             lambda: jnp.zeros((flags.shape[0], num_nodes), bool),
         )
@@ -393,6 +393,15 @@ def _search_touched(num_nodes: int) -> Kernel:
         return _touched(edges, flags, num_nodes)
 
     return one_of_many(rounds, sweeps, 2)
+
+
+def any_of_many(flags: jax.Array) -> jax.Array:
+    """Return whether any flag of many copies (T, n) is set, ().
+
+    Piecewise constant: no derivative passes.
+    """
+    # Copies upon copies first, in vectors, or a CPU would look at them one by one.
+    return jnp.any(jax.lax.optimization_barrier(jnp.any(flags, axis=0)))
 
 
 @jax.custom_batching.custom_vmap
