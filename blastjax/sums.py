@@ -25,16 +25,6 @@ BLOCK = 1024
 
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 """Second moments: a symmetric matrix."""
-ABOUT = np.array(
-    [
-        np.eye(3) - np.diag(np.eye(3)[j])
-        if j == k
-        else -np.outer(np.eye(3)[j], np.eye(3)[k])
-        - np.outer(np.eye(3)[k], np.eye(3)[j])
-        for j, k in PAIRS
-    ]
-).reshape(6, 9)
-"""Inertia by second moment."""
 
 Sums = tuple[jax.Array, jax.Array, jax.Array]
 """By label: masses (A,), centres (A * 3,), inertias about them (A * 9,)."""
@@ -194,6 +184,8 @@ def _rounds(
     element = jnp.arange(num + spare, dtype=named.dtype)[None]
     named = jnp.where(element < num, named, num)
     ones = jnp.ones(block, weight.dtype)
+    # Axis by axis in memory, to be read in vectors.
+    axes = lax.optimization_barrier(place.T)
 
     def following(label: jax.Array) -> jax.Array:
         return jnp.min(jnp.where(named > label[:, None], named, num), axis=1)
@@ -212,13 +204,14 @@ def _rounds(
         mass = sums[:, :1]
         center = lax.optimization_barrier(spatial.ratio(sums[:, 1:4], mass))
         # About the actor's own centre, as in a scatter.
-        arm = [place[None, :, k] - center[:, k, None] for k in range(3)]
+        arm = [axes[k] - center[:, k, None] for k in range(3)]
         heavy = [mask * weight[None] * x for x in arm]
         second = jnp.stack([heavy[j] * arm[k] for j, k in PAIRS])
         second = lax.optimization_barrier(second).reshape(6, size, -1, block)
         second = jnp.sum(jnp.dot(second, ones, precision="highest"), axis=2)
-        about = jnp.asarray(ABOUT, weight.dtype)
-        inertia = sums[:, 4:] + jnp.dot(second.T, about, precision="highest")
+        xx, xy, xz, yy, yz, zz = second
+        about = [yy + zz, -xy, -xz, -xy, xx + zz, -yz, -xz, -yz, xx + yy]
+        inertia = sums[:, 4:] + jnp.stack(about, axis=1)
         center = center + jnp.where(mass != 0, origin, 0)
         found = label, mass[:, 0], center, inertia
         out = [x.at[:, i].set(y) for x, y in zip(out, found, strict=True)]

@@ -27,10 +27,12 @@ def keep_memory():
     """Keep memory that is freed: whoever asks for it again need not clear its pages.
 
     The C library gives arrays above 32 MB back to the system, and gets them anew in
-    every call. What that costs says nothing of the program.
+    every call; what other threads ask for, too, when they do not share one arena. What
+    that costs says nothing of the program. Call it before there are other threads.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:
-        mmap_max, trim_threshold = -4, -1
+        mmap_max, trim_threshold, arena_max = -4, -1, -8
         mallopt(mmap_max, 0)
+        mallopt(arena_max, 1)
         mallopt(trim_threshold, 2**31 - 1)
