@@ -105,7 +105,7 @@ def _by_rounds(
     # An element in the actor of another names an actor of several. At least as many
     # are named as bits are set, and bodies go with others of about as many.
     named = jnp.where((actor >= 0) & (actor != element), actor, num)
-    bits = jnp.where(named < num, jnp.left_shift(1, named % 32), 0)
+    bits = jnp.where(named < num, jnp.left_shift(1, named & 31), 0)
     count = lax.population_count(lax.reduce_or(bits, (1,)))
     turn = jnp.argsort(count).astype(actor.dtype)
     turn = jnp.pad(turn, (0, tiles * width - size), constant_values=size)
@@ -117,9 +117,11 @@ def _by_rounds(
         (named.reshape(tiles, width, num), many.reshape(tiles, width)),
     )
     label, mass, center, inertia, late = (x.reshape(-1, *x.shape[2:]) for x in found)
-    # A product vectorises where a choice would not.
+    # A product vectorises where a choice would not. Behind barriers, or each body would
+    # choose the rows of the table anew.
     single = (actor == element).astype(weight.dtype)
-    own = jnp.where(weight[:, None] != 0, place, 0)
+    own = lax.optimization_barrier(jnp.where(weight[:, None] != 0, place, 0))
+    spin = lax.optimization_barrier(spin)
     at = turn[:, None], label
     out = (
         (single * weight[None]).at[at].set(mass, mode="drop"),
