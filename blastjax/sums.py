@@ -206,7 +206,7 @@ def _rounds(
         mass = sums[:, :1]
         center = lax.optimization_barrier(spatial.ratio(sums[:, 1:4], mass))
         # About the actor's own centre, as in a scatter.
-        arm = [axes[k] - center[:, k, None] for k in range(3)]
+        arm = [axes[None, k] - center[:, k, None] for k in range(3)]
         heavy = [mask * weight[None] * x for x in arm]
         second = jnp.stack([heavy[j] * arm[k] for j, k in PAIRS])
         second = lax.optimization_barrier(second).reshape(6, size, -1, block)

@@ -392,6 +392,7 @@ MODULES = (
     *(equilibrium, failure, limits, loads, parity, world),
 )
 NO_DERIVATIVE = {
+    "graph.any_of_many": "of a whole batch; fracture calls it",
     "graph.anywhere": "means one thing alone and another in a batch: test_lanes",
     "graph.one_of_many": "makes functions; fracture and chunks call them",
     "graph.side_by_side": "makes functions; fracture and chunks call them",
