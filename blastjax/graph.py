@@ -439,8 +439,7 @@ def group_count(group: jax.Array, num_groups: int) -> jax.Array:
 @functools.cache
 def _scattered(num_groups: int, kind: type) -> Kernel:
     """Return the scatter of flags (n,) to groups (n,): any of them, or how many."""
-
-    # Not `.at[]`, whose places go once more through memory. Out of range, they drop.
+    # Not by `.at[]`: there the places go once more through memory.
     scatter_to = jax.lax.scatter if kind is bool else jax.lax.scatter_add
     dtype = bool if kind is bool else jnp.int32
     dims = jax.lax.ScatterDimensionNumbers((), (0,), (0,))

@@ -540,7 +540,8 @@ def _newton(
         return a, slack, *measure(a, slack)
 
     # A loop of two: as fast as one after the other, and compiled once.
-    both = jax.lax.map(begin, jax.tree.map(lambda *x: jnp.stack(x), guess, problem.free))
+    starts = jax.tree.map(lambda *x: jnp.stack(x), guess, problem.free)
+    both = jax.lax.map(begin, starts)
     start = jax.tree.map(lambda x: jnp.where(both[2][0] < both[2][1], x[0], x[1]), both)
     done = _norm(start[3]) * scale < tolerance
     carry = (*start, jnp.zeros((), jnp.int32), done)
