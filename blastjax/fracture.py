@@ -80,7 +80,7 @@ def init(
         belongs = belongs.at[0].set(world)
         label = jnp.where(world, 0, 1).astype(jnp.int32)
     return State(
-        # Behind one too: a batch reads numbers faster than it chooses them by flags.
+        # Behind a barrier: a batch reads numbers faster than it chooses them by flags.
         bond_health=jax.lax.optimization_barrier(jnp.where(real_bond, bond, 0)),
         bond_intact=real_bond,
         chunk_health=jnp.where(real_chunk, chunk, 0),

@@ -515,7 +515,7 @@ def _newton(
             _inner(_add(a, problem.free, -1.0), pushed),
             along,
             _inner(step, pushed),
-            # The derivative at the start of the line.
+            # The derivative at the start of the line, without looking at the rows.
             _SEARCHED * jnp.abs(_inner(step, grad)),
             search_steps,
         )
